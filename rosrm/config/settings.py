@@ -290,7 +290,7 @@ class ClusterConfig:
     Attributes:
         name: name of the cluster and its master.
         ros: domain, discovery and transports.
-        security: "keys": the master accepts only messages of principals with a key; "none": all.
+        security: "keys": accept only messages of principals with a key; "none": accept all.
         state: state directory of the master; by default under XDG_STATE_HOME.
         scoring: policies that order the hosts that fit by the weighted sum of their scores.
         filters: names of placement filters of plugins, with their options.

@@ -37,15 +37,15 @@ class ClusterSecret:
 
     @property
     def signing_key(self) -> SigningKey:
-        """The key by which the master signs its messages to all receivers."""
+        """The key with which the master signs its messages to all receivers."""
         return SigningKey(derived(self.secret, "signature of the master"))
 
     def shared_key(self, grant: Grant) -> bytes:
-        """Return the secret that a principal and the master share, in a generation."""
+        """Return the secret that the master and the principal of a grant share."""
         return derived(self.secret, "principal", str(grant.principal), grant.generation)
 
     def key_of(self, grant: Grant) -> PrincipalKey:
-        """Return the content of a principal's key file."""
+        """Return the key of a principal, as in its key file."""
         return PrincipalKey(grant, self.shared_key(grant), bytes(self.signing_key.verify_key))
 
 
@@ -57,8 +57,8 @@ def own_grant(principal: Principal) -> Grant:
 class Principals:
     """The valid grants of a cluster.
 
-    A principal without a grant is refused, except with a key of generation `OWN`. A stranger may
-    ask for any number of names, so that nothing is stored here.
+    A principal without a grant is refused, except with a key of generation `OWN`. No look-up stores
+    anything, because a sender without a key can name any number of principals.
     """
 
     def __init__(self, grants: Iterable[Grant] = ()) -> None:
@@ -69,6 +69,6 @@ class Principals:
         return self._grants.get(principal) or own_grant(principal)
 
     def valid_grant(self, principal: Principal, generation: int) -> Grant | None:
-        """Return the grant of a principal in a generation; None: it has none."""
+        """Return the grant of a principal in a generation; None if no such grant is valid."""
         grant = own_grant(principal) if generation == OWN else self._grants.get(principal)
         return grant if grant is not None and grant.generation == generation else None

@@ -21,7 +21,7 @@ def derived(key: bytes, purpose: str, *arguments: str | int | bytes) -> bytes:
     """Return a key of `KEY_BYTES` for a purpose.
 
     Args:
-        key: secret of one party of the derived key and the master, or of the master alone.
+        key: the cluster's secret, or a key that was derived from it.
         purpose: use of the derived key, for example "ticket".
         arguments: further values that distinguish the key. Each is preceded by its length, so that
             no two lists of arguments give the same bytes. A number has 64 bits.

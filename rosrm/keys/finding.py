@@ -31,7 +31,7 @@ def master_security(mode: SecurityMode) -> Authority:
 
 
 def host_security(mode: SecurityMode, host: str) -> Member | None:
-    """Return the security of a slave; None: its host has no key yet.
+    """Return the security of a slave; None if its host has no key yet.
 
     Raises:
         ConfigError: a key file is invalid, or others can read it.
@@ -46,7 +46,7 @@ def user_security(mode: SecurityMode, timeout: float = 0.0) -> Member:
         timeout: seconds to wait for a key: the first master of this user may be about to write it.
 
     Raises:
-        NoMaster: there is no key.
+        NoMaster: this user has no key after `timeout`.
         ConfigError: a key file is invalid, or others can read it.
     """
     deadline = time.monotonic() + timeout

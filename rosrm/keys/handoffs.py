@@ -1,8 +1,8 @@
 """Keys of handoffs: one for each instance, and one for each handoff between two of them.
 
-The slave gives the key of an instance to its node, and the master derives the same key. The master
-sends the key of a handoff to its two nodes, to each under the key of its instance. The nodes seal
-their messages to each other under the key of the handoff.
+The slave puts the key of an instance into the environment of its node, and the master derives the
+same key. The master sends the key of a handoff to both nodes, sealed with the keys of their
+instances. The nodes seal their messages to each other with the key of the handoff.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def new_link(key: bytes | None, outward: Direction, inward: Direction) -> Link:
     """Return a link with a new run, whose counters begin at 1.
 
     Args:
-        key: of an instance or a handoff; None: with `security: none`.
+        key: key of a ticket, an instance or a handoff; None with `security: none`.
         outward: direction of the messages that the link seals.
         inward: direction of the messages that it opens.
     """
@@ -38,16 +38,16 @@ class HandoffKeys:
     """The keys that the master derives for handoffs.
 
     Args:
-        _secret: returns that of the cluster, which an operator may replace.
+        _secret: returns the cluster's secret, which `rosrm key rotate` may replace at any time.
         _host_key: returns the key of the host that runs an instance, given by process and number;
-            None: the instance is unknown.
+            None if the instance is unknown.
     """
 
     _secret: Callable[[], bytes]
     _host_key: Callable[[str, int], bytes | None]
 
     def of_instance(self, process: str, number: int) -> bytes | None:
-        """Return the key of an instance; None: it has none."""
+        """Return the key of an instance; None if the instance is unknown."""
         host_key = self._host_key(process, number)
         return None if host_key is None else instance_key(host_key, process, number)
 

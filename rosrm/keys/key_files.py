@@ -1,7 +1,7 @@
 """Key files: the cluster's secret and its grants at the master, one file for each principal.
 
-All files are in one directory, `key_home`. As by ssh, a file that other users can read is refused.
-The file of a principal may have any name that ends in ".key".
+The files that a master, slave or command uses are in the directory `key_home`. Files that other
+users can read are refused, as ssh refuses them. A principal's file may have any name in ".key".
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ GRANTS_FILE: Final = "principals.yaml"
 _LOCK_FILE: Final = "keys.lock"
 _OTHERS: Final = 0o077
 _LARGEST: Final = 1 << 20
-#: Generations of a key are below this number.
+#: The generation of a key is below this number.
 _GENERATIONS: Final = 1 << 32
-#: Fields of a grant, which may be shown.
+#: Fields of a grant, the only ones that an error message may show.
 _PUBLIC: Final = frozenset({"principal", "role", "generation"})
 _WARNING: Final = "# Secret: a reader of this file can act as its owner. Mode 0600.\n"
 
@@ -55,7 +55,7 @@ def key_home() -> Path:
 
 
 def read_secret(home: Path) -> ClusterSecret | None:
-    """Return the cluster's secret; None: there is none in this directory.
+    """Return the cluster's secret; None if this directory has no `cluster.key`.
 
     Raises:
         ConfigError: the file is invalid, or others can read it.
@@ -99,7 +99,7 @@ def rotate(home: Path, directory: Path) -> list[Path]:
 
     Raises:
         ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
-            secret is still valid.
+            secret stays valid.
     """
     secret = ClusterSecret(os.urandom(KEY_BYTES))
     written = []
@@ -116,7 +116,7 @@ def rotate(home: Path, directory: Path) -> list[Path]:
 
 
 def read_grants(home: Path) -> list[Grant]:
-    """Return the grants that are not revoked; [] without a file.
+    """Return the grants that are not revoked; [] if the file does not exist.
 
     Raises:
         ConfigError: the file is invalid, or others can read it.
@@ -125,26 +125,26 @@ def read_grants(home: Path) -> list[Grant]:
 
 
 def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
-    """Give a principal a role and a new key; an earlier key of it ends.
+    """Give a principal a role and a new key; its former key becomes invalid.
 
     Raises:
         ConfigError: the file is invalid, others can read it, or it cannot be written.
     """
     with _locked(home):
         others = [one for one in _all_grants(home) if one[0].principal != principal]
-        # Drawn at random, because a counter would repeat the generation of a revoked key if the
-        # file of the grants was lost or comes from a backup. Then that key would be valid again.
+        # The generation is random, because a counter would repeat that of a revoked key after the
+        # file of the grants was lost or restored from a backup. Then that key would be valid again.
         grant = Grant(principal, role, 1 + secrets.randbelow(_GENERATIONS - 1))
         _write_grants(home, [*others, (grant, False)])
     return grant
 
 
 def revoke(home: Path, principals: Collection[Principal]) -> None:
-    """Revoke the keys of all given principals; on an error, of none.
+    """Revoke the keys of all given principals; revoke no key if an error is raised.
 
     Raises:
-        ConfigError: one of them has no key, the file is invalid, others can read it, or it cannot
-            be written.
+        ConfigError: a principal has no key, or the file is invalid, others can read the file, or
+            the file cannot be written.
     """
     with _locked(home):
         entries = _all_grants(home)
@@ -178,7 +178,7 @@ def _all_grants(home: Path) -> list[tuple[Grant, bool]]:
     rows = fields.get("principals", [])
     if not isinstance(rows, list):
         raise ConfigError(f"{path}: principals: must be a list")
-    # Every value but `false` ends a grant, such as the text "true" of an editor.
+    # Every value but `false` revokes a grant, such as the text "true" from a manual change.
     return [(_grant_in(row, path), row.get("revoked", False) is not False) for row in rows]
 
 
@@ -226,16 +226,16 @@ def read_key(path: Path) -> PrincipalKey:
 
 
 def find_key(kind: str, name: str, home: Path, explicit: str = "") -> PrincipalKey | None:
-    """Return the key that a slave or command of this user uses; None: there is none.
+    """Return the key that a slave or command of this user uses; None if this user has no key.
 
     Args:
         kind: "host" or "user".
-        name: of the host; "": the only key file of this kind, of any user.
+        name: name of the host; "": the only key file of this kind, whatever its name.
         home: directory of this user's keys.
         explicit: path of a key file; "": search `home`, then use the cluster's secret.
 
     Raises:
-        ConfigError: a file is invalid, or several files are of this kind and name.
+        ConfigError: a file is invalid, others can read it, or several files fit.
     """
     if explicit:
         return read_key(Path(explicit))
@@ -290,7 +290,7 @@ def _grant_in(fields: Any, path: Path) -> Grant:
         role = Role(fields["role"])
         generation = fields["generation"]
     except (KeyError, TypeError, ValueError, ConfigError) as error:
-        shown = fields  # a key file has its key here, too
+        shown = fields  # in a key file, `fields` also contains the key
         if isinstance(fields, dict):
             shown = {name: value for name, value in fields.items() if name in _PUBLIC}
         raise ConfigError(f"{path}: invalid entry {shown!r}: {error}") from None
@@ -320,7 +320,7 @@ def _text_of(key: bytes) -> str:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """Return the fields of a file that only its owner can read; None: there is no file."""
+    """Return the fields of a file that only its owner can read; None if it does not exist."""
     try:
         descriptor, mode = open_own(str(path), os.O_RDONLY | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -335,7 +335,7 @@ def _read(path: Path) -> dict[str, Any] | None:
                 f"key add` again on the machine of the master"
             )
         content = file.read(_LARGEST + 1)
-    if len(content) > _LARGEST:  # its beginning alone might lack the end of a grant
+    if len(content) > _LARGEST:  # a truncated file could lack `revoked: true`
         raise ConfigError(f"the key file {path} has more than {_LARGEST} bytes")
     try:
         fields = yaml.safe_load(content)
@@ -351,7 +351,7 @@ def _text(fields: Mapping[str, Any]) -> str:
 
 
 def _write(path: Path, fields: Mapping[str, Any]) -> None:
-    """Write a file that only its owner can read, whole or not at all, and onto the disk."""
+    """Replace a file atomically, with mode 0600, and sync it to the disk."""
     content = _text(fields).encode()
     if len(content) > _LARGEST:
         raise ConfigError(f"{path} cannot be written: it would have more than {_LARGEST} bytes")
@@ -363,9 +363,9 @@ def _write(path: Path, fields: Mapping[str, Any]) -> None:
 
 @contextlib.contextmanager
 def _locked(home: Path) -> Iterator[None]:
-    """Create the directory of keys if it is missing, and lock it for this process.
+    """Create the directory of keys if it is missing, and hold its lock.
 
-    Without the lock, one of two commands at the same time could overwrite the grant of the other.
+    Without the lock, two commands at the same time could overwrite each other's grants.
     """
     try:
         make_private_directory(home)

@@ -1,9 +1,10 @@
-"""Packets by which two slaves measure the round trip of the link between them.
+"""Packets with which two slaves measure the round trip of the link between them.
 
-A probe has the number of its sender's host and a random number; the echo has that number and the
-time that it has waited at the other slave. Both end with a tag of keyed BLAKE2b. Its key is derived
-from the key of the probed host, so that a stranger can forge neither, and the probed slave stores
-nothing. A recorded probe yields one more echo of the same size, which its sender ignores.
+A probe contains the number of the probing host and a random number. The echo contains both numbers,
+and the time between the arrival of the probe and the sending of the echo. Each packet ends with a
+tag of keyed BLAKE2b. The key is derived from the key of the probed host. So a sender without that
+key can forge no packet, and the probed slave stores no keys of other hosts. A recorded probe that
+is sent again yields one more echo of the same size, which the probing slave ignores.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ NONCE_BYTES: Final = 16
 
 _TAG_BYTES: Final = 16
 _PERSON: Final = b"rosrm link 1"
-#: Version and kind, host number of the prober, random number, and nanoseconds of the wait.
+#: Version and kind, number of the probing host, random number, and nanoseconds of the wait.
 _FORM: Final = struct.Struct("<4sI16sQ")
 _PROBE: Final = b"rL1p"
 _ECHO: Final = b"rL1e"
@@ -31,8 +32,8 @@ class Packet(NamedTuple):
     """A packet whose tag is not checked yet.
 
     Attributes:
-        is_echo: it answers a probe.
-        host_id: number of the prober's host.
+        is_echo: True for an echo, False for a probe.
+        host_id: number of the probing host.
         nonce: random number of the probe.
         wait: nanoseconds between the arrival of the probe and the sending of its echo.
     """
@@ -54,10 +55,10 @@ def echo(key: bytes, received: Packet, wait: int) -> bytes:
 
 
 def opened(data: bytes, key_of: Callable[[Packet], bytes | None]) -> Packet | None:
-    """Return a received packet; None: it is not genuine.
+    """Return a received packet; None if the packet is not genuine.
 
     Args:
-        key_of: returns the key by which a packet must be tagged; None: there is none.
+        key_of: returns the key with which a packet must be tagged; None to drop the packet.
     """
     if len(data) != PACKET_BYTES:
         return None

@@ -1,8 +1,8 @@
 """Links: one end of the messages between two parties under one key.
 
-A link seals the messages of its own side, and opens those of the other side. A request is bound to
-the run of its receiver, and an answer to its request. So a recorded request cannot be used after a
-restart of the receiver, nor a recorded answer for another request.
+A link seals the messages of its own side, and opens the messages of the other side. A request is
+bound to the run of its receiver, and an answer to its request. So a recorded request has no effect
+after a restart of the receiver, and a recorded answer does not open for another request.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple, Protocol
 
 from rosrm.keys.sealing import Direction, Opener, Sealer, channel_key
 
-#: Pairs of run and channel whose newest counters are stored. Each command of a user is a run.
+#: Pairs of run and channel whose newest counters are stored. Each command of a user has a new run.
 _RUNS: Final = 256
 
 #: Openers by run of the sender and channel, the least recently used first.
@@ -28,9 +28,9 @@ class SealedMessage(NamedTuple):
     """A message as it is sent.
 
     Attributes:
-        run: of the sender.
-        counter: of the sender on this channel; the first is 1.
-        body: the sealed message, `OVERHEAD` bytes longer than the plain one.
+        run: run of the sender.
+        counter: number of the message in that run on this channel; the first is 1.
+        body: the sealed message, `OVERHEAD` bytes longer than the plain message.
     """
 
     run: bytes
@@ -59,12 +59,12 @@ class Link(Protocol):
     def open(
         self, channel: bytes, message: SealedMessage, context: bytes = b"", *, is_bound: bool = True
     ) -> bytes | None:
-        """Return a message of the other side; None: it is not genuine, or a repetition.
+        """Return a message of the other side; None if the message is forged or repeated.
 
         Args:
-            is_bound: it is meant for this run of the receiver. Others have no effect, and anyone
-                may have recorded any number of them in former runs. So they are counted apart, and
-                the counters of bound messages are not forgotten for them.
+            is_bound: True for a message to this run of the receiver. Messages to former runs have
+                no effect, but anyone can send recorded ones. The counters of both are stored apart;
+                otherwise messages to former runs would displace the counters of this run.
         """
 
     def opener(self, channel: bytes, run: bytes) -> OpenMessage:
@@ -75,10 +75,10 @@ class KeyedLink:
     """A link under the key of a principal.
 
     Args:
-        key: of the principal.
-        run: of this side.
+        key: key of the principal.
+        run: run of this side.
         outward: direction of the messages that this side seals.
-        inward: direction of those that it opens.
+        inward: direction of the messages that this side opens.
     """
 
     def __init__(self, key: bytes, run: bytes, outward: Direction, inward: Direction) -> None:
@@ -102,13 +102,13 @@ class KeyedLink:
     def open(
         self, channel: bytes, message: SealedMessage, context: bytes = b"", *, is_bound: bool = True
     ) -> bytes | None:
-        """Return a message of the other side; None: it is not genuine, or a repetition."""
+        """Return a message of the other side; None if the message is forged or repeated."""
         openers = self._bound if is_bound else self._unbound
         opener = self._opener_in(openers, channel, message.run)
         plaintext = opener.open(message.counter, message.body, context)
         if plaintext is None:
             return None
-        # Only now: a stranger makes nothing be stored.
+        # After the check, because a message without a valid key must not use memory.
         _remember(openers, channel, message.run, opener)
         return plaintext
 

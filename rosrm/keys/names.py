@@ -9,7 +9,7 @@ def instance_name(process: str, number: int) -> str:
 
 
 def named_instance(name: str) -> tuple[str, int] | None:
-    """Return process and number from the name of an instance; None: the text is no such name."""
+    """Return process and number from the name of an instance; None for any other text."""
     kind, _, instance = name.partition(":")
     process, _, number = instance.rpartition("#")
     if kind != "instance" or not (process and number.isascii() and number.isdecimal()):

@@ -77,8 +77,8 @@ class Grant:
     """The role of a principal.
 
     Attributes:
-        generation: number that distinguishes the keys of the principal, from 1; 0: a key without a
-            grant, derived by a program that can read the cluster's secret.
+        generation: number that distinguishes the keys of the principal, from 1; 0 for a key that
+            needs no entry in `principals.yaml`, because its holder can read the cluster's secret.
     """
 
     principal: Principal
@@ -96,7 +96,7 @@ _BEARERS: Final = frozenset({Role.BEARER})
 #: Roles that key files can have.
 GRANTED: Final = (Role.VIEWER, Role.SUBMITTER, Role.OPERATOR, Role.HOST)
 
-#: The roles that may send a request, by the name of its service. Others are refused.
+#: The roles that may send a request, by the name of its service. All other roles are refused.
 ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "handshake": _READERS | _HOSTS,
     "introduce": _SUBMITTERS | _HOSTS,
@@ -115,7 +115,7 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "register_host": _HOSTS,
     "leave": _HOSTS,
     "request_process": _HOSTS,
-    # Of slaves:
+    # Services of slaves:
     "control": _MASTERS,
     "read_log": _BEARERS,
     "store_replica": _BEARERS,

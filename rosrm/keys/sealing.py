@@ -3,8 +3,8 @@
 A key belongs to one direction (a principal to the master, or back), one run of the sender and one
 channel (a topic, or the requests or answers of a service). So a message does not open on another
 channel, at another receiver or for another run, and the sender's counter is a nonce that never
-repeats. Messages of one sender on one channel arrive in order. So a message is repeated if its
-counter is not above the newest one.
+repeats. Messages of one sender on one channel arrive in order. So a message is a repetition if its
+counter is not above the counter of the newest message.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LAST_COUNTER: Final = 2**64 - 1
 
 
 class Direction(str, Enum):
-    """Direction of the messages of a key."""
+    """Direction of the messages that a key seals."""
 
     TO_MASTER = "to the master"
     FROM_MASTER = "from the master"
@@ -58,9 +58,9 @@ def channel_key(principal_key: bytes, direction: Direction, run: bytes, channel:
     """Return the key of one channel.
 
     Args:
-        principal_key: of a principal, ticket, instance or handoff.
-        direction: of the messages.
-        run: of the sender, `RUN_BYTES`.
+        principal_key: key of a principal, ticket, instance or handoff.
+        direction: direction of the messages.
+        run: run of the sender, `RUN_BYTES`.
         channel: see `channel_of`.
     """
     return derived(principal_key, direction.value, run, channel)
@@ -75,14 +75,14 @@ class Sealer:
     """Seals the messages of one channel.
 
     Attributes:
-        counter: of the last message.
+        counter: counter of the last sealed message; 0 before the first.
     """
 
     _key: bytes = field(repr=False)
     counter: int = 0
 
     def seal(self, plaintext: bytes, context: bytes = b"") -> bytes:
-        """Return a message, `OVERHEAD` bytes longer; `counter` is the number to send beside it.
+        """Return the sealed message, `OVERHEAD` bytes longer; send `counter` beside it.
 
         Args:
             plaintext: the message.
@@ -99,14 +99,14 @@ class Opener:
     """Opens the messages of one channel, each once and in order.
 
     Attributes:
-        newest: counter of the newest message that was opened.
+        newest: counter of the newest opened message; 0 before the first.
     """
 
     _key: bytes = field(repr=False)
     newest: int = 0
 
     def open(self, counter: int, sealed: bytes, context: bytes = b"") -> bytes | None:
-        """Return the plaintext; None: the message is repeated, or not genuine."""
+        """Return the plaintext; None if the message is forged or repeated."""
         if not self.newest < counter <= LAST_COUNTER or len(sealed) < OVERHEAD:
             return None
         try:

@@ -34,7 +34,7 @@ UNKNOWN_RUN: Final = bytes(RUN_BYTES)
 _MASTER: Final = Principal("user", "rosrm-master")
 #: Valid tickets of one bearer that a slave accepts: at most two for each of a thousand processes.
 _MOST_TICKETS: Final = 4096
-#: The same for all peers of a part without security.
+#: Peers that a master, slave or client with `security: none` stores.
 _MOST_PEERS: Final = 20_000
 
 
@@ -49,10 +49,10 @@ class Peer:
 
     Attributes:
         name: principal or ticket whose key seals the messages of both sides.
-        generation: of the key.
+        generation: generation of the key.
         link: seals messages for the peer, and opens messages of the peer.
         grant: rights of the peer.
-        ticket: ticket of the peer; None: the peer is a principal or the master.
+        ticket: the ticket whose key seals the messages; None for a principal or the master.
         run: newest known run of the peer, to which messages for the peer are bound.
     """
 
@@ -68,7 +68,7 @@ class Security(Protocol):
     """Interface of the security of a master, slave or client.
 
     Attributes:
-        run: random number of this part's run.
+        run: random number of the run of this master, slave or client.
         described: text for users, for example "the key of host:robot-1".
         tickets_from: lowest version of the tickets that are in force.
     """
@@ -78,10 +78,10 @@ class Security(Protocol):
     tickets_from: int
 
     def peer(self, name: str, generation: int) -> Peer | None:
-        """Return the peer with the key of this name and generation; None: there is no valid one."""
+        """Return the peer with this name and key generation; None if no such key is valid."""
 
     def remember(self, peer: Peer) -> None:
-        """Store a peer whose message was genuine; a stranger is never stored."""
+        """Store a peer after a genuine message; forged messages must not use memory."""
 
     def accepts(self, ticket: Ticket) -> bool:
         """Return True if the ticket of a genuine request is in force."""
@@ -106,26 +106,29 @@ class Member(Security, Protocol):
         """Store the time of a beat of the master, and the lowest version of tickets in force."""
 
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
-        """Return the slave for which this part is the bearer of a ticket.
+        """Return the slave to which this slave or client sends requests with a ticket.
 
         Args:
             ticket: text of the ticket.
-            key: of the ticket.
-            run: of the slave.
+            key: key of the ticket.
+            run: run of the slave.
         """
 
     def instance_key(self, process: str, number: int) -> bytes | None:
-        """Return the key of an instance on this host; None: with `security: none`."""
+        """Return the key of an instance on this host; None with `security: none`."""
 
     def link_key(self, host_id: int) -> bytes:
-        """Return the key of packets from the slave of another host; b"": `security: none`."""
+        """Return the key with which the slave of another host measures its link to this host.
+
+        The key is b"" with `security: none`.
+        """
 
 
 class MemberSecurity:
     """Security of a slave or client, which has a key and one master.
 
     Attributes:
-        run: random number of this part's run.
+        run: random number of the run of this slave or client.
         master: the master.
     """
 
@@ -149,14 +152,14 @@ class MemberSecurity:
         if ticket is None:
             return None
         if not self._is_valid(ticket):
-            return self._bearer_of(ticket)  # the bearer is genuine, if its message opens
+            return self._bearer_of(ticket)  # a genuine request gets the answer `stale`
         held: Mapping[str, Peer] = self._bearers.get(ticket.bearer, {})
         return held.get(name) or (self._bearer_of(ticket) if self._has_room(held) else None)
 
     def _has_room(self, held: Mapping[str, Peer]) -> bool:
         """Return True if a bearer may use another ticket.
 
-        No valid ticket is forgotten, because its recorded requests would then open again.
+        No valid ticket is removed from memory; otherwise its recorded requests would open again.
         """
         return len(held) < _MOST_TICKETS or not self._is_valid(_oldest(held))
 
@@ -165,7 +168,7 @@ class MemberSecurity:
         return Peer(ticket.text(), 0, link, _bearer_grant(ticket), ticket)
 
     def remember(self, peer: Peer) -> None:
-        """Keep a bearer whose request was genuine, as long as its ticket is valid."""
+        """Store the bearer of a genuine request; remove the expired tickets of that bearer."""
         if peer.ticket is None or not self._is_valid(peer.ticket):
             return
         held = self._bearers.setdefault(peer.ticket.bearer, OrderedDict())
@@ -185,10 +188,10 @@ class MemberSecurity:
         return ticket.is_valid(time.monotonic_ns(), self._beat_at)
 
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
-        """Return the slave to which a ticket of this part introduces.
+        """Return the slave to which this slave or client sends requests with a ticket.
 
-        The master may give the same ticket twice. So each link has a run of its own, because two
-        links with the run of this part would use the same nonces.
+        The master may give the same ticket twice. So each link has a new run; otherwise two links
+        would use the same nonces under the same key.
         """
         link = new_link(key, Direction.TO_PEER, Direction.FROM_PEER)
         return Peer(ticket, 0, link, self.master.grant, run=run)
@@ -198,7 +201,7 @@ class MemberSecurity:
         return instance_key(self._key.key, process, number)
 
     def link_key(self, host_id: int) -> bytes:
-        """Return the key of packets from the slave of another host."""
+        """Return the key with which the slave of another host measures its link to this host."""
         return derived(self._key.key, "link", host_id)
 
     def signature(self, content: bytes) -> bytes:
@@ -225,14 +228,14 @@ class MasterSecurity:
         self.tickets_from = 0
         self.described = "keys"
         self._peers: dict[tuple[str, int], Peer] = {}
-        # Links by key, also of ended grants. A key may become valid again, with another role or a
-        # secret from a backup, and a new link would use the same nonces again.
+        # Links by key, also of revoked and replaced keys. Such a key may become valid again, with
+        # another role or a secret from a backup; a new link would then repeat nonces.
         self._links: dict[bytes, Link] = {}
         self._secret = secret
         self.replace(secret, grants)
 
     def replace(self, secret: ClusterSecret, grants: Iterable[Grant]) -> None:
-        """Replace secret and grants; drop the links of principals whose grant has changed."""
+        """Replace secret and grants; remove the peers whose key or role is no longer valid."""
         self.tickets_from += 1
         changed = self._peers and secret != self._secret
         self._secret = secret
@@ -244,12 +247,12 @@ class MasterSecurity:
         }  # fmt: skip
 
     def has_access(self, peer: Peer) -> bool:
-        """Return True while key and rights of a peer are valid."""
+        """Return True while the key and the role of a peer are valid."""
         grant = self._principals.valid_grant(peer.grant.principal, peer.generation)
         return grant == peer.grant and self._link_of(peer.grant) is peer.link
 
     def peer(self, name: str, generation: int) -> Peer | None:
-        """Return a principal with a valid grant of this generation."""
+        """Return the principal with a valid grant of this generation; None if no grant is valid."""
         known = self._peers.get((name, generation))
         if known is not None:
             return known
@@ -265,7 +268,7 @@ class MasterSecurity:
         return known or KeyedLink(key, self.run, Direction.FROM_MASTER, Direction.TO_MASTER)
 
     def remember(self, peer: Peer) -> None:
-        """Keep a principal whose message was genuine."""
+        """Store a principal after a genuine message."""
         if self._peers.get((peer.name, peer.generation)) is not peer:
             self._peers[peer.name, peer.generation] = peer
             self._links[self._secret.shared_key(peer.grant)] = peer.link
@@ -276,15 +279,15 @@ class MasterSecurity:
         return False
 
     def introduction(self, host: Peer, ticket: Ticket) -> bytes:
-        """Return the key of the bearer of a ticket for a host."""
+        """Return the key of a ticket for requests to the slave of `host`."""
         return ticket.key(self._secret.shared_key(host.grant))
 
     def link_key_of(self, host: Peer, host_id: int) -> bytes:
-        """Return the key of packets from the slave of another host, given by its number, to one."""
+        """Return the key with which host number `host_id` measures its link to `host`."""
         return derived(self._secret.shared_key(host.grant), "link", host_id)
 
     def client(self) -> MemberSecurity:
-        """Return the security of this master as a client of another one with the same secret."""
+        """Return the security with which this master sends requests to one of the same secret."""
         grant = own_grant(_MASTER)
         return MemberSecurity(self._secret.key_of(grant))
 
@@ -293,8 +296,8 @@ class MasterSecurity:
 
         Args:
             process: name of the process. Another user may have submitted that name before.
-            first: lowest number of an instance whose snapshots are valid, which distinguishes the
-                submissions.
+            first: lowest number of an instance whose snapshots are valid. This number is different
+                for each submission of the name.
         """
         return derived(self._secret.secret, "state", process, first)
 
@@ -302,7 +305,8 @@ class MasterSecurity:
         """Return the keys of handoffs.
 
         Args:
-            host_of: returns the host of an instance, given by process and number; None: unknown.
+            host_of: returns the host of an instance, given by process and number; None if it is
+                unknown.
         """
 
         def host_key(process: str, number: int) -> bytes | None:
@@ -312,12 +316,15 @@ class MasterSecurity:
         return HandoffKeys(lambda: self._secret.secret, host_key)
 
     def _grant_of_host(self, host: str) -> Grant:
-        """Return the grant by which a host spoke last, or will speak after this master's start."""
+        """Return the grant of the key that the slave of a host uses.
+
+        Before the first message of the slave, assume the key in its grant.
+        """
         principal = Principal("host", host)
         granted, own = self._principals.grant_of(principal), own_grant(principal)
-        has_spoken = (str(principal), granted.generation) in self._peers
-        own_alone = not has_spoken and (str(principal), own.generation) in self._peers
-        return own if own_alone else granted
+        uses_granted = (str(principal), granted.generation) in self._peers
+        uses_own = not uses_granted and (str(principal), own.generation) in self._peers
+        return own if uses_own else granted
 
     def signature(self, content: bytes) -> bytes:
         """Return the signature of a message to all receivers."""
@@ -333,11 +340,11 @@ class NoSecurity:
     """`security: none`: every message is accepted under the principal that it names.
 
     Args:
-        principal: of this slave or client; None: this is the master.
-        run: random number of this part's run; None: a new one.
+        principal: principal of this slave or client; None for the master.
+        run: random number of the run of this master, slave or client; None: a new number.
 
     Attributes:
-        run: random number of this part's run.
+        run: random number of the run of this master, slave or client.
         master: the master, for a slave or client.
     """
 
@@ -352,7 +359,7 @@ class NoSecurity:
         self.master = Peer(name, 0, self._link, grant)
 
     def peer(self, name: str, generation: int) -> Peer | None:
-        """Return the principal with all rights of its kind; None: the name is invalid."""
+        """Return the principal with all rights of its kind; None if the name is invalid."""
         if (name, generation) == (self.master.name, self.master.generation):
             return self.master
         known = self._peers.get((name, generation))
@@ -367,22 +374,22 @@ class NoSecurity:
             return None
 
     def remember(self, peer: Peer) -> None:
-        """Store a peer, up to a bound."""
+        """Store a peer; remove the least recently used one beyond `_MOST_PEERS`."""
         self._peers[peer.name, peer.generation] = peer
         self._peers.move_to_end((peer.name, peer.generation))
         if len(self._peers) > _MOST_PEERS:
             self._peers.popitem(last=False)
 
     def note_beat(self, tickets_from: int) -> None:
-        """Store the lowest version of the tickets in force."""
+        """Store the lowest version of tickets in force."""
         self.tickets_from = tickets_from
 
     def accepts(self, ticket: Ticket) -> bool:
-        """Return True if a ticket is of a version in force."""
+        """Return True if the version of a ticket is in force."""
         return ticket.version >= self.tickets_from
 
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
-        """Return the slave for which this part is the bearer of a ticket."""
+        """Return the slave to which this slave or client sends requests with a ticket."""
         del key
         return Peer(ticket, 0, self._link, self.master.grant, run=run)
 
@@ -406,7 +413,7 @@ class NoSecurity:
         return b""
 
     def client(self) -> NoSecurity:
-        """Return the security of this master as a client of another one."""
+        """Return the security with which this master sends requests to another master."""
         return NoSecurity(_MASTER)
 
     def snapshot_key(self, process: str, first: int) -> bytes:
@@ -451,9 +458,10 @@ def _bearer_grant(ticket: Ticket) -> Grant:
 def _tag(content: bytes, master: bytes) -> bytes:
     """Return the tag of a message of the master.
 
-    Its key is the master's public key, which only members have, in their key files. A check of the
-    tag takes a fiftieth of the time of that of the signature. So a stranger cannot keep members
-    busy, whatever number of messages it sends. A member could forge the tag, but no signature.
+    The key of the tag is the master's public key, which only slaves and clients with a key have. A
+    check of the tag takes a fiftieth of the time of a check of the signature. So a sender without a
+    key cannot use up their CPU time with forged messages. Every slave or client with a key could
+    forge the tag, but not the signature.
     """
     return blake2b(content, key=master, digest_size=_TAG_BYTES, person=_TAG_PERSON).digest()
 

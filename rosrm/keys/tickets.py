@@ -2,7 +2,8 @@
 
 The master sends the bearer the text of a ticket, and a key that is derived from the key of the
 slave's host and that text. Each request contains the text, and the slave derives the same key from
-it. So the master sends nothing to the slave, and the slave stores nothing.
+that text. So the master sends nothing to the slave. The slave stores a ticket only after a genuine
+request with it.
 """
 
 from __future__ import annotations
@@ -27,13 +28,13 @@ class Ticket(NamedTuple):
 
     Attributes:
         until: time of the slave's monotonic clock at which the ticket expires, ns.
-        version: of the keys with which the master made it. When a key is revoked, the tickets of
-            earlier versions are void.
+        version: version of the master's keys at which the master made the ticket. When a key is
+            revoked, tickets of earlier versions become invalid.
         service: name of the slave's service, for example "read_log".
         first: lowest number of an instance whose logs may be read. Instances of lower numbers
             belonged to another owner of the name.
-        process: the process of all requests.
-        bearer: the principal that got the ticket.
+        process: name of the only process that requests with the ticket may concern.
+        bearer: the principal to which the master gave the ticket.
     """
 
     until: int
@@ -50,8 +51,8 @@ class Ticket(NamedTuple):
         the master's newest beat is valid until the next one; otherwise slaves would send no more
         replicas of snapshots.
 
-        The slave's clock begins again when the host boots. So a ticket from before, which seems to
-        be valid for longer than any ticket, is void.
+        The slave's clock begins again when the host boots. So a ticket that expires later than
+        `TICKET_LIFE` from now is from before the last boot, and is invalid.
 
         Args:
             now: time of the slave's clock, ns.
@@ -70,10 +71,10 @@ class Ticket(NamedTuple):
 
 
 def ticket_of(text: str) -> Ticket | None:
-    """Return the ticket of a text; None: the text is none.
+    """Return the ticket that a text describes; None if the text is no ticket.
 
-    A ticket has exactly one text, because the counters of its messages belong to the text. With a
-    second one, such as "007" for 7, a stranger could repeat its messages.
+    Each ticket has exactly one valid text, because the counters of messages are stored by text.
+    With a second text, such as "007" for 7, anyone could send recorded messages again.
     """
     until, _, rest = text.removeprefix(_PREFIX).partition(":")
     version, _, rest = rest.partition(":")

@@ -47,6 +47,6 @@ def _how_to_get_a_key(host: str) -> str:
 
 
 def security_without_key(host: str) -> Member:
-    """Return a security with a random key, whose messages are accepted by no other part."""
+    """Return a security with a random key, whose messages no master, slave or client accepts."""
     grant = own_grant(Principal("host", host))
     return MemberSecurity(PrincipalKey(grant, os.urandom(KEY_BYTES), os.urandom(KEY_BYTES)))

@@ -27,14 +27,14 @@ _STANDARD_OUTPUT: Final = 1
 
 @key.callback()
 def _group() -> None:
-    """Manage the keys of hosts and users, on the machine of the master (`check`: on any)."""
+    """Manage the keys of hosts and users. Run these on the master's machine; `check` on any."""
 
 
 @key.command()
 def init() -> None:
-    """Create the cluster's secret, unless this user has one already.
+    """Create the cluster's secret, unless this user already has a secret.
 
-    `rosrm master` does this, too. A program that can read the file has all rights in the cluster.
+    `rosrm master` does so, too. A program that can read the file has all rights in the cluster.
     """
     from rosrm.keys import key_files
 
@@ -52,7 +52,7 @@ def add(
         typer.Option(
             "--role", metavar="ROLE",
             help="Role of a user: viewer (reads), submitter (changes its own processes) or "
-            "operator (everything).  [default: that of its present key, else submitter]",
+            "operator (everything).  [default: role of the present key, else submitter]",
         ),
     ] = None,
     out: Annotated[
@@ -65,9 +65,9 @@ def add(
 ) -> None:  # fmt: skip
     """Make a new key for a host or user, and write its key file.
 
-    An earlier key of the same principal ends at once. Copy the file to ~/.config/rosrm/ of the user
-    that will use it. In a directory that others can read use --out: with `> FILE` the shell creates
-    the file before its mode is 0600.
+    A running master refuses the former key of the host or user within a second. Copy the file to
+    ~/.config/rosrm/ of the user that will use it. In a directory that others can read, use --out:
+    with `> FILE` the shell creates the file before its mode is 0600.
     """
     from rosrm.keys import key_files
     from rosrm.keys.roles import GRANTED, Role, principal_of
@@ -89,7 +89,7 @@ def add(
         echo(key_files.text_of(made).rstrip())
     else:
         key_files.write_key(out, made)
-    former = "; its former key has ended" if present else ""
+    former = "; its former key is no longer valid" if present else ""
     echo(
         f"rosrm: {named} has a new key (role {chosen}){former}. Copy the file to ~/.config/rosrm/ "
         f"of the user that will use it, with mode 0600",
@@ -98,7 +98,7 @@ def add(
 
 
 def _make_output_private() -> None:
-    """Give the file behind the standard output mode 0600, before it holds a key."""
+    """Set mode 0600 on the file of a redirected standard output, before a key is written."""
     facts = os.fstat(_STANDARD_OUTPUT)
     if stat.S_ISREG(facts.st_mode) and facts.st_uid == os.geteuid():
         os.fchmod(_STANDARD_OUTPUT, 0o600)
@@ -118,8 +118,8 @@ def list_keys() -> None:
         rows.add_row(str(grant.principal), grant.role.value, str(grant.generation))
     console().print(rows)
     echo(
-        f"{counted(len(grants), 'key', 'keys')}; this user has all rights in the cluster, by "
-        f"{home / key_files.CLUSTER_FILE}"
+        f"{counted(len(grants), 'key', 'keys')}; this user has all rights in the cluster, because "
+        f"{home / key_files.CLUSTER_FILE} is readable"
     )
 
 
@@ -147,14 +147,15 @@ def rotate(
 ) -> None:  # fmt: skip
     """Create a new secret for the cluster, and write new key files for all principals.
 
-    All former keys end when the master reads the new secret, within a second. Copy each file to its
-    host or user, and restart all slaves.
+    A running master refuses all former keys within a second. Copy each file to its host or user,
+    and restart all slaves.
     """
     from rosrm.keys import key_files
 
     _secret()
     written = key_files.rotate(key_files.key_home(), directory)
-    echo(f"a new secret; {counted(len(written), 'key file', 'key files')} in {directory}")
+    files = counted(len(written), "key file", "key files")
+    echo(f"created a new secret; wrote {files} to {directory}")
 
 
 @key.command()
@@ -174,9 +175,9 @@ def check(
         ),
     ] = "",
 ) -> None:  # fmt: skip
-    """Show which keys this user has on this machine, and what they do not protect.
+    """Show the keys of this user on this machine, and list what keys do not protect.
 
-    Exits with 1 if a key is missing, open to others, or not valid.
+    Exits with 1 if this user has no key, others can read a key, or a key is not valid.
     """
     from rosrm.cli.output.keys import file_report, user_report
     from rosrm.keys.key_files import key_home
@@ -197,7 +198,7 @@ def _secret() -> ClusterSecret:
     secret = key_files.read_secret(home)
     if secret is None:
         raise ConfigError(
-            f"there is no {home / key_files.CLUSTER_FILE}: run this on the machine of the master, "
-            f"as its user, or begin with `rosrm key init`"
+            f"there is no {home / key_files.CLUSTER_FILE}: run this command on the master's "
+            f"machine as the master's user, or create the file with `rosrm key init`"
         )
     return secret

@@ -72,7 +72,7 @@ def user_report(home: Path, host: str = "") -> KeyReport:
     report.rows.append(("directory", str(home)))
     _check_mode(report, home)
     if default_security() == "none":
-        report.rows.append(("security", "none, by ROSRM_SECURITY: keys are not used"))
+        report.rows.append(("security", "none (ROSRM_SECURITY): keys are not used"))
     has_secret = _check_files(report, home)
     found = [
         _report_part(report, home, "commands", "user", ""),

@@ -65,8 +65,8 @@ def test_a_command_of_the_master_refuses_another_machine(rosrm, home, words):
     result = rosrm("key", *words)
     assert (result.code, result.out) == (2, "")
     assert result.err == (
-        f"rosrm: there is no {home}/cluster.key: run this on the machine of the master, as its "
-        "user, or begin with `rosrm key init`\n"
+        f"rosrm: there is no {home}/cluster.key: run this command on the master's machine as "
+        "the master's user, or create the file with `rosrm key init`\n"
     )
     assert not home.exists()
 
@@ -76,7 +76,7 @@ def test_a_new_key_has_the_role_of_the_present_one(rosrm, secret):
     for words in (("--role", "viewer"), (), ("--role", "operator"), ()):
         has_key = bool(listed(rosrm))
         said = rosrm("key", "add", "user:ada", *words).err
-        assert ("its former key has ended" in said) is has_key
+        assert ("its former key is no longer valid" in said) is has_key
     assert listed(rosrm) == [("user:ada", "operator")]
     assert rosrm("key", "revoke", "user:ada").code == 0
     assert rosrm("key", "add", "user:ada").code == 0
@@ -195,7 +195,7 @@ def test_a_rotation_writes_new_files_of_all_that_have_a_key(rosrm, home, secret,
         rosrm("key", "add", name)
     rosrm("key", "revoke", "host:gone")
     result = rosrm("key", "rotate", "--out", tmp_path / "new")
-    assert result.out == f"a new secret; 3 key files in {tmp_path}/new\n"
+    assert result.out == f"created a new secret; wrote 3 key files to {tmp_path}/new\n"
     changed = key_files.read_secret(home)
     assert changed != secret
     files = sorted((tmp_path / "new").iterdir())
@@ -333,7 +333,7 @@ def test_the_variable_chooses_a_key(rosrm, robot, monkeypatch):
 def test_security_that_is_switched_off_is_shown(rosrm, secret, monkeypatch):
     monkeypatch.setenv("ROSRM_SECURITY", "none")
     shown = facts(rosrm("key", "check"))
-    assert shown["security"] == ["none, by ROSRM_SECURITY: keys are not used"]
+    assert shown["security"] == ["none (ROSRM_SECURITY): keys are not used"]
 
 
 def test_a_directory_that_others_can_write_is_a_problem(rosrm, home, secret):
