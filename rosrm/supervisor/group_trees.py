@@ -7,9 +7,11 @@ its state directory, because other supervisors may run in the same group.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import resource
+from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from rosrm.runtime import cgroups
@@ -18,6 +20,7 @@ from rosrm.runtime import cgroups
 PREFIX: Final = "rosrm-state-"
 #: Controllers in order: the first tree answers questions about the members of a group.
 _CONTROLLERS: Final = ("memory", "cpuacct", "cpu")
+_TRIES: Final = 10
 _CAP_SYS_NICE: Final = 1 << 23
 _HOW: Final = (
     "give the unit of the slave `Delegate=yes` and `DelegateSubgroup=rosrm-agent`, or start it "
@@ -107,8 +110,9 @@ def _tree(mount: cgroups.Mount, known: set[str], name: str, root: str) -> Tree |
     top = os.path.join(base, name)
     tree = Tree(mount.version, top, home, controllers)
     if not os.path.isdir(top):
-        make_top(tree)
-        os.rmdir(top)
+        make_repeatedly(lambda: make_top(tree))
+        with contextlib.suppress(FileNotFoundError):
+            os.rmdir(top)
     return tree
 
 
@@ -117,6 +121,21 @@ def make_top(tree: Tree) -> None:
     os.makedirs(tree.top, exist_ok=True)
     if tree.version == 2:
         cgroups.enable(tree.top, tree.controllers)
+
+
+def make_repeatedly(make: Callable[[], None]) -> None:
+    """Call a function that makes groups until none of them was removed meanwhile. Raises OSError.
+
+    A supervisor that starts removes the empty groups of all others.
+    """
+    for tries_left in reversed(range(_TRIES)):
+        try:
+            make()
+        except FileNotFoundError:
+            if not tries_left:
+                raise
+        else:
+            return
 
 
 def _offered(mount: cgroups.Mount) -> set[str]:

@@ -18,7 +18,7 @@ from typing import Final
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
 from rosrm.supervisor import own_log
-from rosrm.supervisor.group_trees import PREFIX, Tree, make_top
+from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
 from rosrm.wording import size
 
@@ -279,8 +279,12 @@ def _make(path: str, tree: Tree) -> None:
             os.rmdir(path)
             os.mkdir(path)
     except FileNotFoundError:  # the first one, or another supervisor removed the group above
-        make_top(tree)
-        os.mkdir(path)
+
+        def make_both() -> None:
+            make_top(tree)
+            os.mkdir(path)
+
+        make_repeatedly(make_both)
 
 
 def _enter(path: str) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 
 import pytest
 
@@ -12,8 +14,8 @@ from rosrm.core.supervisor.rules import LimitRule
 from rosrm.model.values import InstanceState, RestartPolicy
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.client import SupervisorClient
-from rosrm.supervisor.instance_groups import pids
-from tests.waiting import wait_gone, wait_until
+from rosrm.supervisor.instance_groups import pids, remove_empty
+from tests.waiting import PATIENCE, wait_gone, wait_until
 
 MB = 1_000_000
 #: Says that it begins, then writes to each page of many bytes.
@@ -183,9 +185,30 @@ def test_a_supervisor_whose_group_was_removed_makes_it_again(host, client) -> No
     host.run(client, host.order("first", "true"))
     wait_removed(client)
     for _, top, _ in client.groups:
-        Path(top).rmdir()
+        remove_empty(top)
     pid = host.sleeper(client, "second")
     assert pids(str(group_of(client, "second"))) == [pid]
+
+
+def test_limits_are_found_while_another_supervisor_removes_empty_groups(
+    enforcement, tmp_path
+) -> None:
+    """A supervisor that starts removes the empty groups of all others."""
+    ended = Event()
+
+    def remove() -> None:
+        while not ended.is_set():
+            for tree in enforcement.trees:
+                remove_empty(tree.top)
+
+    with ThreadPoolExecutor() as threads:
+        removing = threads.submit(remove)
+        try:
+            found = [group_trees.find(str(tmp_path)).missing for _ in range(300)]
+        finally:
+            ended.set()
+        removing.result(PATIENCE)
+    assert found == [enforcement.missing] * 300
 
 
 def test_nothing_is_left_of_a_supervisor_that_has_ended(host, client) -> None:
