@@ -8,7 +8,7 @@ from typing import Any
 from rosrm.config.settings import LinkSettings, NetworkSettings, ScoringChoice
 from rosrm.testing.local_cluster import LocalCluster
 from tests.ros.clusters import MIB, STEADY, host, node, service
-from tests.waiting import wait_until
+from tests.waiting import PATIENCE, wait_until
 
 MB = 1e6
 
@@ -97,6 +97,6 @@ def test_the_rate_of_a_topic_is_learned_as_a_flow_between_its_processes(make_clu
         found = [one for one in cluster.client.explain("viewer")["flows"] if one["rate"]]
         return found[0] if found else None
 
-    flow = wait_until(learned, "a learned flow", pause=cluster.client.spin)
+    flow = wait_until(learned, "a learned flow", 2 * PATIENCE, pause=cluster.client.spin)
     assert (flow["process"], flow["host"], flow["learned"]) == ("camera", "a", True)
     assert 0.3 * MB < flow["rate"] < 3 * MB

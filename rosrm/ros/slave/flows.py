@@ -107,8 +107,10 @@ class FlowSampler:
         if self._sample is not None:
             self._go_on(self._sample)
         elif self._clock() >= self._next_at and nodes:
+            # Made once, so its CPU time, which is that of many samples, is none of theirs.
+            self._node = self._node or self._make_node()
             began, cpu = self._clock(), self._cpu()
-            self._begin(nodes, began, cpu)
+            self._begin(self._node, nodes, began, cpu)
             if self._sample is None:
                 self._wait(cpu)
 
@@ -122,20 +124,19 @@ class FlowSampler:
         """Let the next sample begin when the CPU time since `cpu` is a small part of the time."""
         self._next_at = self._clock() + max(_PAUSE, (self._cpu() - cpu) / SHARE)
 
-    def _begin(self, nodes: Mapping[int, str], now: float, cpu: float) -> None:
+    def _begin(self, node: Node, nodes: Mapping[int, str], now: float, cpu: float) -> None:
         """Begin a sample of the topic that was sampled longest ago, if it is due."""
-        self._node = self._node or self._make_node()
         due = [
             (self._sampled_at.get((number, topic), -_RENEWED), number, topic, kind)
             for number, name in nodes.items()
-            for topic, kind in self._subscribed(name)
+            for topic, kind in _subscribed(node, name)
         ]
         at, number, topic, kind = min(due, default=(now, 0, "", ""))
         if now - at < _RENEWED:
             return
         key = (number, topic)
         self._sampled_at[key] = now
-        publishers = self._node.get_publishers_info_by_topic(topic)
+        publishers = node.get_publishers_info_by_topic(topic)
         if not publishers:
             self._sampled_at[key] = now - _RENEWED + _DISCOVERY
         if len(publishers) != 1:
@@ -144,22 +145,10 @@ class FlowSampler:
         publisher = f"{publishers[0].node_namespace.rstrip('/')}/{publishers[0].node_name}"
         try:
             profile = qos.best_effort(depth=_DEPTH)
-            subscription = polled_subscription(self._node, message_type(kind), topic, profile)
+            subscription = polled_subscription(node, message_type(kind), topic, profile)
         except Exception:  # noqa: BLE001 - whatever a package or the middleware raises
             return  # the type is not installed on this host
         self._sample = _Sample(key, publisher, subscription, now, cpu)
-
-    def _subscribed(self, full_name: str) -> Iterator[tuple[str, str]]:
-        """Yield the topics to which a node subscribes, with their types."""
-        assert self._node is not None
-        namespace, _, name = full_name.rpartition("/")
-        try:
-            found = self._node.get_subscriber_names_and_types_by_node(name, namespace or "/")
-        except Exception:  # noqa: BLE001 - rclpy's error for a node that is not in the graph
-            return
-        for topic, kinds in found:
-            if topic not in _OF_EVERY_NODE and len(kinds) == 1:
-                yield topic, kinds[0]
 
     def _go_on(self, sample: _Sample) -> None:
         for content, info in waiting(sample.subscription, _DEPTH):
@@ -173,3 +162,15 @@ class FlowSampler:
             if sample.key in self._sampled_at:  # the instance has not ended since
                 self._rates[sample.key] = (sample.publisher, sample.rate(now))
             self._wait(sample.cpu)
+
+
+def _subscribed(node: Node, full_name: str) -> Iterator[tuple[str, str]]:
+    """Yield the topics to which a node subscribes, with their types."""
+    namespace, _, name = full_name.rpartition("/")
+    try:
+        found = node.get_subscriber_names_and_types_by_node(name, namespace or "/")
+    except Exception:  # noqa: BLE001 - rclpy's error for a node that is not in the graph
+        return
+    for topic, kinds in found:
+        if topic not in _OF_EVERY_NODE and len(kinds) == 1:
+            yield topic, kinds[0]

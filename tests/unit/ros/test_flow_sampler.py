@@ -31,3 +31,23 @@ def test_a_topic_without_a_publisher_is_looked_at_again_soon(publishers, looked_
     assert all(before <= at <= before + 6 for at, before in zip(found, looked_at, strict=True)), (
         found
     )
+
+
+def test_the_cpu_time_of_making_the_node_delays_no_sample() -> None:
+    """It is spent once, as much as that of many samples, mostly before a topic was discovered."""
+    now, cpu, looks = [0.0], [0.0], []
+
+    def topics_of(*_: str) -> list[object]:
+        looks.append(now[0])
+        return []
+
+    def make_node() -> SimpleNamespace:
+        cpu[0] += 1.0
+        return SimpleNamespace(get_subscriber_names_and_types_by_node=topics_of)
+
+    sampler = FlowSampler(make_node, clock=lambda: now[0], cpu=lambda: cpu[0])
+    while len(looks) < 2:
+        sampler.look({1: "/viewer"})
+        now[0] += 1.0
+        assert now[0] < 1000.0, looks
+    assert looks == [0.0, 5.0]
