@@ -41,6 +41,11 @@ def lab_is_possible():
         pytest.skip(f"needs root and what a lab is made of: {reason}")
 
 
+#: Marks of the mounts that other labs and tests make and remove at any time. pyroute2, like `ip`,
+#: makes /run/netns a mount point with the first namespace, permanently.
+_OF_OTHERS = frozenset({"rosrm-lab", "/run/netns", "/pytest-of-"})
+
+
 def remains(lab: str) -> dict[str, set[str]]:
     """Return all traces on this machine that a lab could leave; other labs may appear any time."""
     losetup = ["losetup", "-n", "-O", "BACK-FILE"]
@@ -49,10 +54,7 @@ def remains(lab: str) -> dict[str, set[str]]:
     commands = {_text(path) for path in Path("/proc").glob("[0-9]*/cmdline")}
     return {
         "namespaces": {path.name for path in Path("/run/netns").glob(f"rosrm-lab:{lab}*")},
-        # pyroute2, like `ip`, makes /run/netns a mount point with the first namespace, permanently.
-        "mounts": {
-            line for line in mounts if lab in line or not {"rosrm-lab", "/run/netns"} & _words(line)
-        },
+        "mounts": {line for line in mounts if lab in line or not _OF_OTHERS & _words(line)},
         "groups": _below(Path("/sys/fs/cgroup"), lab),
         "processes": {line for line in commands if lab in line and "rosrm_lab/inside" in line},
         "loops": {line for line in loops if lab in line},
@@ -80,8 +82,8 @@ def _below(root: Path, start: str) -> set[str]:
 
 
 def _words(line: str) -> set[str]:
-    """Return the target of a mount, and "rosrm-lab" if the mount belongs to a lab."""
-    return {line.split()[1]} | ({"rosrm-lab"} if "rosrm-lab" in line else set())
+    """Return the target of a mount, and which of the marks of `_OF_OTHERS` are in its line."""
+    return {line.split()[1]} | {mark for mark in _OF_OTHERS if mark in line}
 
 
 def _text(path: Path) -> str:
