@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from dataclasses import replace
 
@@ -19,6 +20,9 @@ def main(role: str, path: str, domain: str) -> int:
         path: of the file.
         domain: ROS domain that replaces the one of the file; "": none.
     """
+    # A plugin may print when it is imported or called: that goes to the error output.
+    output = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)
     registry = Registry.discover()
     try:
         config = (load_cluster if role == "master" else load_host)(path, registry)
@@ -27,7 +31,8 @@ def main(role: str, path: str, domain: str) -> int:
         return fault.exit_code
     if domain:
         config = replace(config, ros=replace(config.ros, domain=int(domain)))
-    sys.stdout.write(config.to_json())
+    with output:
+        output.write(config.to_json())
     return 0
 
 

@@ -60,7 +60,10 @@ class SettingsCheck:
             return
         self._waiting.append(done)
         if self._process is None:
-            self._begin()
+            try:
+                self._begin()
+            except OSError as error:
+                self._tell("", f"the check of {self._source.path} cannot be started: {error}")
 
     def hang_up(self, _number: int, _frame: Any) -> None:
         """Handle a SIGHUP: let the next `poll` begin a check."""
@@ -95,13 +98,16 @@ class SettingsCheck:
             process.kill()
             process.wait()
         settings, errors = _read(self._output), _read(self._errors)
-        self._process, waiting = None, self._waiting
-        self._waiting = []
+        self._process = None
         if code is None:
             errors = f"the check of {self._source.path} took more than {CHECK_TIMEOUT - 1.0:g} s"
         fault = "" if code == 0 else errors or f"the check ended with exit code {code}"
+        self._tell("" if fault else settings, fault)
+
+    def _tell(self, settings: str, fault: str) -> None:
+        waiting, self._waiting = self._waiting, []
         for done in waiting:
-            done("" if fault else settings, fault)
+            done(settings, fault)
 
     def close(self) -> None:
         """End a check that runs."""

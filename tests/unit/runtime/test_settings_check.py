@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -51,6 +52,38 @@ def test_an_invalid_file_yields_place_and_allowed_values(tmp_path: Path) -> None
     assert "did you mean 'limits'?" in fault
     path.write_text("host: h\nlimits: {memory: 0.5}\n")
     assert HostConfig.from_json(outcome(SettingsSource("slave", str(path)))[0]).limits["memory"]
+
+
+def test_what_a_plugin_prints_is_no_part_of_the_settings(tmp_path: Path, monkeypatch) -> None:
+    """A plugin may print when it is imported, also from C."""
+    folder = tmp_path / "talker-1.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: talker\nVersion: 1\n")
+    (folder / "entry_points.txt").write_text("[rosrm]\ntalker = talker\n")
+    says = "import os\nprint('hello')\nos.write(1, b'hello again')\n"
+    (tmp_path / "talker.py").write_text(says)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    path = tmp_path / "host.yaml"
+    path.write_text("host: h\n")
+    text, fault = outcome(SettingsSource("slave", str(path)))
+    assert (HostConfig.from_json(text).host, fault) == ("h", "")
+
+
+def test_a_check_that_cannot_be_started_is_a_fault(tmp_path: Path, monkeypatch) -> None:
+    """The runtime goes on with its settings, and can check the file later."""
+    path = tmp_path / "host.yaml"
+    path.write_text("host: h\n")
+    source, found = SettingsSource("slave", str(path)), list[tuple[str, str]]()
+    check = SettingsCheck(source, lambda *_: None)
+    with monkeypatch.context() as limited:
+        limited.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+        check.start(lambda *answer: found.append(answer))
+    ((text, fault),) = found
+    assert text == ""
+    assert fault.startswith(f"the check of {path} cannot be started: ")
+    check.start(lambda *answer: found.append(answer))
+    wait_until(lambda: check.poll() or found[1:], "the check has ended")
+    assert found[1][1] == ""
 
 
 def test_a_runtime_without_a_file_has_nothing_to_read() -> None:
