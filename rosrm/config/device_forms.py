@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Annotated, Any, Final
 
 from rosrm.model.devices import Device, DeviceNeed
@@ -25,7 +26,10 @@ class AskedDevices:
     def read(given: Any) -> DeviceNeed:
         """Return the need in a file; raise `ValueError`, but not for a number out of range."""
         if isinstance(given, (int, float)) and not isinstance(given, bool):
-            return DeviceNeed("", float(given))
+            try:
+                return DeviceNeed("", float(given))
+            except OverflowError:
+                return DeviceNeed("", inf)
         units = given if isinstance(given, list) and given else [given]
         if not all(map(_is_name, units)):
             raise ValueError(

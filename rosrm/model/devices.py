@@ -128,8 +128,9 @@ def device_fault(devices: Iterable[Device]) -> str:
         for text in (device.path, device.about, device.missing):
             if not text.isprintable() or len(text) > _LONGEST_TEXT:
                 return f"{device.title}: {text!r:.200} is no printable text"
-        if not 1 <= device.shareable <= MOST_SHARING:
-            return f"{device.title}: shareable is {device.shareable}; allowed: 1 to {MOST_SHARING}"
+        many: object = device.shareable
+        if type(many) is not int or not 1 <= many <= MOST_SHARING:
+            return f"{device.title}: shareable is {many!r}; allowed: 1 to {MOST_SHARING}"
     if len(known) > MOST_DEVICES:
         return f"{len(known)} devices; at most {MOST_DEVICES}"
     return ""

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.model.devices import MOST_DEVICES, Device
-from rosrm.wording import sanitized
+from rosrm.wording import listed, sanitized
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -80,8 +80,7 @@ def _joined(device: Device, found: _Units | None) -> Device:
     if found is None:
         return device
     if device.unit not in found:
-        there = ", ".join(found) or "none"
-        return replace(device, missing=f"no probe finds it; found: {there}")
+        return replace(device, missing=f"no probe finds it; found: {listed(found)}")
     other = found[device.unit]
     return replace(device, path=device.path or other.path, about=other.about, missing=other.missing)
 

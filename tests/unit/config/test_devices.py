@@ -76,6 +76,7 @@ def test_devices_of_a_process(file, section, expected):
         ("{gpu: 1e9}", "is not within 0.001..256"),
         ("{gpu: .nan}", "devices: gpu: nan is not within 0.001..256"),
         ("{gpu: .inf}", "devices: gpu: inf is not within"),
+        (f"{{gpu: 1{400 * '0'}}}", "devices: gpu: inf is not within"),
         ("{gpu: true}", "devices.gpu: True: a number such as 1 or 0.5, the name of a unit"),
         ("{gpu: []}", "devices.gpu: []: a number such as 1 or 0.5, the name of a unit"),
         ("{camera: [a, a]}", "camera: a unit is given twice: a, a"),

@@ -55,7 +55,7 @@ def test_the_settings_choose_the_units_of_a_kind() -> None:
     watch = DeviceWatch(configured)
     watch.look({"gpu": (GPU, Device("gpu", "1")), "tpu": (Device("tpu", "0"),)})
     assert watch.devices == (
-        GPU, Device("gpu", "7", missing="no probe finds it; found: 0, 1"),
+        GPU, Device("gpu", "7", missing="no probe finds it; found: 0 and 1"),
     )  # fmt: skip
     watch.look({})
     assert watch.devices == configured["gpu"]
@@ -89,6 +89,16 @@ def test_a_probe_that_cannot_read_still_says_which_devices_are_there() -> None:
     sampler.close()
 
 
+def test_a_missing_unit_of_a_kind_with_very_many_units_has_a_short_reason() -> None:
+    """The master would refuse a longer one, with the whole report."""
+    units = tuple(Device("gpu", f"{number:064}") for number in range(200))
+    watch = DeviceWatch({"gpu": (Device("gpu", "x"),)})
+    watch.look({"finder": units})
+    (missing,) = watch.devices
+    assert missing.missing.startswith("no probe finds it; found: 000")
+    assert len(missing.missing) < 1000
+
+
 @pytest.mark.parametrize(
     ("answer", "reason"),
     [
@@ -97,6 +107,7 @@ def test_a_probe_that_cannot_read_still_says_which_devices_are_there() -> None:
         (["gpu"], "Device is required"),
         ([GPU, GPU], "devices(): gpu 0 is given twice"),
         ([Device("gpu", "../x")], "devices(): gpu: '../x' cannot be a unit"),
+        ([Device("gpu", "0", shareable=2.0)], "gpu 0: shareable is 2.0; allowed: 1 to"),
     ],
 )
 def test_a_probe_that_answers_no_devices_is_stale_with_the_reason(answer, reason) -> None:
