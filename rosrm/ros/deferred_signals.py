@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Final
 
@@ -36,5 +36,6 @@ def signals_deferred() -> Iterator[None]:
     finally:
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        for arrival, frame in arrived.items():
-            handlers[signal.Signals(arrival)](arrival, frame)
+        with ExitStack() as calls:  # each handler is called, also if another one raises
+            for arrival, frame in reversed(arrived.items()):
+                calls.callback(handlers[signal.Signals(arrival)], arrival, frame)

@@ -53,6 +53,30 @@ def test_a_signal_during_a_wait_ends_the_wait(handler_of_sigterm, number, expect
     assert signal.getsignal(number) is before
 
 
+def test_a_second_signal_is_handled_although_the_handler_of_the_first_raised() -> None:
+    """Otherwise the second one would be lost."""
+    handled: list[int] = []
+
+    def handle(number: int, _frame: object) -> None:
+        handled.append(number)
+        raise Ended
+
+    def raise_both() -> None:
+        with signals_deferred():
+            for number in numbers:
+                signal.raise_signal(number)
+
+    numbers = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, handle) for number in numbers]
+    try:
+        with pytest.raises(Ended):
+            raise_both()
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+    assert handled == list(numbers)
+
+
 def test_other_threads_wait_as_before() -> None:
     """Python allows signal handlers in the main thread only."""
     ended = threading.Event()
