@@ -72,6 +72,14 @@ def test_a_veto_of_any_policy_holds_and_names_it():
     assert (hosts["c"]["verdict"], hosts["c"]["reason"]) == ("vetoed", "quiet: no place on c")
 
 
+def test_the_sum_of_very_large_scores_is_finite():
+    """An infinite sum would exclude the host."""
+    large = ByName(dict.fromkeys("abc", 1e308))
+    cluster = chained(ScoringLink("one", large), ScoringLink("other", large))
+    cluster.submit(process("p"))
+    assert cluster.where("p") == ["a"]
+
+
 @pytest.mark.parametrize("at", [0, 1, 2])
 def test_a_policy_that_fails_is_left_out_of_the_sum(at):
     """The others decide as if it were not there, and the decision names the failure."""

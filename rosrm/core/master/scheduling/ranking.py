@@ -254,7 +254,7 @@ def _scored(
         "scoring", link.name, "score",
         lambda: checked_scores(link.policy.score(*views), views[0], fits),
     )  # fmt: skip
-    if link.weight != 1.0:
+    if len(hosts.demand.plugins.chain) > 1 or link.weight != 1.0:
         score = link.weight * np.clip(np.nan_to_num(score), -_LARGEST_SCORE, _LARGEST_SCORE)
     return score, veto
 
