@@ -124,7 +124,7 @@ def make_top(tree: Tree) -> None:
 
 
 def make_repeatedly(make: Callable[[], None]) -> None:
-    """Call a function that makes groups until none of them was removed meanwhile. Raises OSError.
+    """Make groups; again if another supervisor removes one of them. Raises OSError.
 
     A supervisor that starts removes the empty groups of all others.
     """

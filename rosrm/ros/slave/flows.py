@@ -107,7 +107,7 @@ class FlowSampler:
         if self._sample is not None:
             self._go_on(self._sample)
         elif self._clock() >= self._next_at and nodes:
-            # Made once, so its CPU time, which is that of many samples, is none of theirs.
+            # The node is made once. Its CPU time, as much as that of many samples, counts for none.
             self._node = self._node or self._make_node()
             began, cpu = self._clock(), self._cpu()
             self._begin(self._node, nodes, began, cpu)

@@ -34,7 +34,7 @@ def test_a_topic_without_a_publisher_is_looked_at_again_soon(publishers, looked_
 
 
 def test_the_cpu_time_of_making_the_node_delays_no_sample() -> None:
-    """It is spent once, as much as that of many samples, mostly before a topic was discovered."""
+    """The CPU time is spent once, mostly before a topic is discovered."""
     now, cpu, looks = [0.0], [0.0], []
 
     def topics_of(*_: str) -> list[object]:

@@ -70,7 +70,7 @@ def test_what_a_plugin_prints_is_no_part_of_the_settings(tmp_path: Path, monkeyp
 
 
 def test_a_check_that_cannot_be_started_is_a_fault(tmp_path: Path, monkeypatch) -> None:
-    """The runtime goes on with its settings, and can check the file later."""
+    """The runtime keeps its settings, and can check the file later."""
     path = tmp_path / "host.yaml"
     path.write_text("host: h\n")
     source, found = SettingsSource("slave", str(path)), list[tuple[str, str]]()
