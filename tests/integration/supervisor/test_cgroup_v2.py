@@ -60,6 +60,18 @@ def group(tmp_path: Path) -> Iterator[str]:
         Path(folder).rmdir()
 
 
+@pytest.fixture(autouse=True)
+def alone() -> Iterator[None]:
+    """Let no other thread of the test run ask for the interpreter while this one forks by clone3.
+
+    The supervisor has one thread. A child that had to yield to another one would wait for ever.
+    """
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1000.0)
+    yield
+    sys.setswitchinterval(before)
+
+
 @pytest.fixture
 def groups(group: str) -> InstanceGroups:
     """Return groups of instances below the group of the test, without controllers."""
