@@ -192,7 +192,7 @@ class SealedEndpoints(Generic[SecurityT]):
         Args:
             handle: called with each genuine request and the means to answer it. If it raises before
                 it has answered, the request is answered as failed.
-            first_contact: accept requests of peers that do not know the run of this part.
+            first_contact: accept requests of peers that do not know this master or slave's run.
         """
         requests, answers = request_channel(service_type, name), answer_channel(service_type, name)
         service = name.rpartition("/")[2]
