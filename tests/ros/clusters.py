@@ -57,8 +57,16 @@ def python(name: str, code: str, **options) -> ProcessSpec:
     return ProcessSpec(name, command=(sys.executable, "-ISc", code), kind=kind, **options)
 
 
+#: Last lines of a program with a node: however its context ends, the program ends with success.
+SPIN = """
+try:
+    rclpy.spin(node)
+except BaseException:
+    pass
+"""
 #: A ROS node of a few lines that prints its name, parameters and topic, and ends with its context.
-NODE = """
+NODE = (
+    """
 import json, sys, rclpy
 from rclpy.node import Node
 rclpy.init()
@@ -69,11 +77,9 @@ print(json.dumps({
     "parameters": {name: node.get_parameter(name).value for name in names},
     "topic": node.resolve_topic_name("chatter"),
 }), flush=True)
-try:
-    rclpy.spin(node)
-except BaseException:  # however the context ends, the node ends with success
-    pass
 """
+    + SPIN
+)
 
 
 def node(name: str, code: str = NODE, **options) -> ProcessSpec:

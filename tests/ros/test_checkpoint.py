@@ -25,6 +25,7 @@ from tests.ros.clusters import (
     MIB,
     PATIENCE,
     QUICK,
+    SPIN,
     STEADY,
     alive,
     host,
@@ -37,7 +38,8 @@ from tests.ros.portable_kit import AS_ROOT
 pytestmark = pytest.mark.timeout(240)
 
 #: Publishes one number after the other.
-COUNTER = """
+COUNTER = (
+    """
 import rclpy
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Int64
@@ -49,11 +51,9 @@ def tick():
     count += 1
     output.publish(Int64(data=count))
 timer = node.create_timer(0.02, tick)
-try:
-    rclpy.spin(node)
-except BaseException:
-    pass
 """
+    + SPIN
+)
 
 
 class Listener:

@@ -16,7 +16,7 @@ from rosrm.core.slave.watches import NoState, Watch
 from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.health import HealthMonitor
-from tests.ros.clusters import STEADY, alive, host, node, service
+from tests.ros.clusters import SPIN, STEADY, alive, host, node, service
 from tests.waiting import wait_gone, wait_until
 
 #: Seconds: far more than a busy machine takes between two messages.
@@ -27,7 +27,8 @@ AGAIN = RestartPolicy("on-failure", delay=0.2)
 
 #: A lifecycle node that publishes at 20 Hz. `last`: number of the last message; `leaves`: leave the
 #: active state with that message.
-TALKER = """
+TALKER = (
+    """
 import rclpy, sys
 from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Int64
@@ -49,25 +50,22 @@ def tick():
 timer = node.create_timer(0.05, tick)
 node.trigger_configure()
 node.trigger_activate()
-try:
-    rclpy.spin(node)
-except BaseException:
-    pass
 """
+    + SPIN
+)
 
 #: A node that publishes an absolute topic name with a given type.
-SPEAKER = """
+SPEAKER = (
+    """
 import rclpy, std_msgs.msg
 rclpy.init()
 node = rclpy.create_node("unnamed")
 kind = getattr(std_msgs.msg, node.declare_parameter("type", "").value)
 output = node.create_publisher(kind, "/clash", 1)
 timer = node.create_timer(0.05, lambda: output.publish(kind()))
-try:
-    rclpy.spin(node)
-except BaseException:
-    pass
 """
+    + SPIN
+)
 
 #: Seconds without a core that a healthy node survives on a busy machine.
 STARVED = 10.0
@@ -202,7 +200,7 @@ class Counter(Node):
 rclpy.init()
 try:
     rclpy.spin(Counter())
-except BaseException:
+except BaseException:  # as in SPIN
     pass
 """
 

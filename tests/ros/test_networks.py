@@ -7,7 +7,7 @@ from typing import Any
 
 from rosrm.config.settings import LinkSettings, NetworkSettings, ScoringChoice
 from rosrm.testing.local_cluster import LocalCluster
-from tests.ros.clusters import MIB, STEADY, host, node, service
+from tests.ros.clusters import MIB, SPIN, STEADY, host, node, service
 from tests.waiting import PATIENCE, wait_until
 
 MB = 1e6
@@ -53,7 +53,8 @@ def test_links_are_measured_and_their_limits_hold(make_cluster) -> None:
 
 
 #: Publishes 20 messages of 50 kB a second.
-CAMERA = """
+CAMERA = (
+    """
 import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
@@ -62,23 +63,20 @@ node = Node("camera")
 out = node.create_publisher(String, "image", 5)
 image = String(data="x" * 50_000)
 node.create_timer(0.05, lambda: out.publish(image))
-try:
-    rclpy.spin(node)
-except BaseException:
-    pass
 """
-VIEWER = """
+    + SPIN
+)
+VIEWER = (
+    """
 import rclpy
 from rclpy.node import Node
 from std_msgs.msg import String
 rclpy.init()
 node = Node("viewer")
 node.create_subscription(String, "image", lambda _: None, 5)
-try:
-    rclpy.spin(node)
-except BaseException:
-    pass
 """
+    + SPIN
+)
 
 
 def test_the_rate_of_a_topic_is_learned_as_a_flow_between_its_processes(make_cluster) -> None:

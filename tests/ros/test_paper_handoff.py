@@ -9,11 +9,12 @@ import pytest
 from rosrm.config.settings import MigrationSettings
 from rosrm.errors import Refused
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
-from tests.ros.clusters import QUICK, host
+from tests.ros.clusters import QUICK, SPIN, host
 from tests.waiting import PATIENCE
 
 #: Plain rclpy: publishes its state in every cycle; a shadow starts from a received state.
-COUNTER = """
+COUNTER = (
+    """
 import os, rclpy
 from rclpy.node import Node
 from std_msgs.msg import Int64
@@ -36,11 +37,9 @@ def cycle():
 
 node.create_subscription(Int64, "/counter/state", initialise, 1)
 node.create_timer(0.02, cycle)
-try:
-    rclpy.spin(node)
-except BaseException:
-    pass
 """
+    + SPIN
+)
 #: The same, but a shadow subscribes to the state only in the function that `state_config` calls.
 CONFIGURED = COUNTER.replace(
     'node.create_subscription(Int64, "/counter/state", initialise, 1)',
