@@ -391,6 +391,11 @@ def host_to_msg(host: values.HostDescription) -> msg.HostDescription:
         _to_msg(msg.ResourceDescription, resource, slot=slot)
         for slot, resource in enumerate(host.resources)
     ]
+    absent, unenforced = (
+        {name: sendable(reason) for name, reason in reasons.items()}
+        for reasons in (host.absent, host.unenforced)
+    )
+    host = replace(host, absent=absent, unenforced=unenforced)
     return _to_msg(msg.HostDescription, host, resources=resources)
 
 

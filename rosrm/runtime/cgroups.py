@@ -5,6 +5,7 @@ The supervisor imports this module: it stays small.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import re
@@ -43,7 +44,7 @@ class Mount(NamedTuple):
 
 
 def mounts(root: str = "/") -> list[Mount]:
-    """Return the mounted hierarchies, version 1 first.
+    """Return the mounted hierarchies, version 1 first; lines of another form are left out.
 
     Args:
         root: of the file system; another one for recorded trees.
@@ -52,24 +53,27 @@ def mounts(root: str = "/") -> list[Mount]:
         OSError: /proc cannot be read.
     """
     found = []
-    with open(os.path.join(root, "proc/self/mountinfo"), encoding="utf-8") as file:
-        for line in file:
-            before, _, after = line.rstrip("\n").partition(" - ")
-            kind, _, options = after.split(" ", 2)
-            if kind in ("cgroup", "cgroup2"):
-                fields = before.split(" ")
-                point = os.path.join(root, _unescaped(fields[4]).lstrip("/"))
-                version = 1 if kind == "cgroup" else 2
-                words = frozenset(options.split(","))
-                found.append(Mount(version, _unescaped(fields[3]), point, words))
+    for line in _lines(os.path.join(root, "proc/self/mountinfo")):
+        before, _, after = line.partition(" - ")
+        fields, words = before.split(" "), after.split(" ", 2)
+        if words[0] in ("cgroup", "cgroup2") and len(fields) > 4:
+            point = os.path.join(root, _unescaped(fields[4]).lstrip("/"))
+            version = 1 if words[0] == "cgroup" else 2
+            controllers = frozenset(words[-1].split(","))
+            found.append(Mount(version, _unescaped(fields[3]), point, controllers))
     return sorted(found, key=lambda mount: mount.version)
 
 
 def own_group(mount: Mount, root: str = "/") -> str | None:
-    """Return the directory of this process's group; None: it is not visible at this mount."""
-    with open(os.path.join(root, "proc/self/cgroup"), encoding="utf-8") as file:
-        lines = [line.rstrip("\n").split(":", 2) for line in file]
-    for _, names, path in lines:
+    """Return the directory of this process's group; None: it is not visible at this mount.
+
+    Raises:
+        OSError: /proc cannot be read.
+    """
+    for line in _lines(os.path.join(root, "proc/self/cgroup")):
+        names, _, path = line.partition(":")[2].partition(":")
+        if not path.startswith("/"):
+            continue
         if (mount.version == 2 and not names) or set(names.split(",")) & mount.controllers - {""}:
             inside = os.path.relpath(path, mount.root)
             directory = os.path.normpath(os.path.join(mount.point, inside))
@@ -105,19 +109,22 @@ def enable(group: str, controllers: tuple[str, ...]) -> None:
 def delegate(root: str = "/") -> None:
     """Prepare this process's group of version 2 for groups below it, if that is possible.
 
-    The process moves into a group of its own if it is the last one that hinders this.
+    The process moves into a group of its own if it is the last one that hinders this. If it is not
+    possible, `rosrm.supervisor.group_trees` says why.
     """
-    for mount in mounts(root):
-        own = own_group(mount, root) if mount.version == 2 else None
-        if own is None:
-            continue
+    with contextlib.suppress(OSError):
+        for mount in mounts(root):
+            if mount.version == 2:
+                with contextlib.suppress(OSError):
+                    _delegate(mount, root)
+
+
+def _delegate(mount: Mount, root: str) -> None:
+    own = own_group(mount, root)
+    if own is not None:
         base = os.path.dirname(own) if os.path.basename(own) == AGENTS else own
-        try:
-            offered = read(os.path.join(base, "cgroup.controllers")).split()
-            wanted = tuple(name for name in LIMITING if name in offered)
-            _enable_or_move(base, wanted)
-        except OSError:
-            continue  # `rosrm.supervisor.group_trees` says why
+        offered = read(os.path.join(base, "cgroup.controllers")).split()
+        _enable_or_move(base, tuple(name for name in LIMITING if name in offered))
 
 
 def _enable_or_move(base: str, controllers: tuple[str, ...]) -> None:
@@ -153,6 +160,12 @@ def write(path: str, value: str) -> None:
         os.write(descriptor, value.encode())
     finally:
         os.close(descriptor)
+
+
+def _lines(path: str) -> list[str]:
+    """Return the lines of a file; the paths in it may have any bytes. Raises OSError."""
+    with open(path, "rb") as file:
+        return os.fsdecode(file.read()).split("\n")
 
 
 def _unescaped(path: str) -> str:

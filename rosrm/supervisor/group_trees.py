@@ -150,7 +150,9 @@ def _offered(mount: cgroups.Mount) -> set[str]:
 
 
 def _why_not(mount: cgroups.Mount, error: OSError, root: str) -> str:
-    group = cgroups.own_group(mount, root) or mount.point
+    group = mount.point
+    with contextlib.suppress(OSError):
+        group = cgroups.own_group(mount, root) or group
     if error.errno == errno.EBUSY:
         reason = f"other processes are in the control group {group}, or it is not delegated"
     else:

@@ -6,6 +6,7 @@ container the groups above its own are not visible; only the visible ones count.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -102,11 +103,7 @@ def count_cpus(text: str) -> int:
 def _paths(root: Path, pid: str) -> dict[str, str]:
     """Return the path of the group by controller; that of version 2 under ""."""
     paths: dict[str, str] = {}
-    try:
-        lines = (root / "proc" / pid / "cgroup").read_text().splitlines()
-    except OSError:
-        return paths
-    for line in lines:
+    for line in lines_of(root / "proc" / pid / "cgroup"):
         _, controllers, path = line.split(":", 2)
         for controller in controllers.split(","):
             paths[controller] = path
@@ -115,11 +112,7 @@ def _paths(root: Path, pid: str) -> dict[str, str]:
 
 def _mounts(root: Path, pid: str) -> list[_Mount]:
     mounts = []
-    try:
-        lines = (root / "proc" / pid / "mountinfo").read_text().splitlines()
-    except OSError:
-        return []
-    for line in lines:
+    for line in lines_of(root / "proc" / pid / "mountinfo"):
         before, _, after = line.partition(" - ")
         kind, _, options = after.split(" ", 2)
         if kind not in ("cgroup", "cgroup2"):
@@ -130,6 +123,14 @@ def _mounts(root: Path, pid: str) -> list[_Mount]:
         version = 1 if kind == "cgroup" else 2
         mounts.append(_Mount(_unescaped(fields[3]), point, version, controllers))
     return mounts
+
+
+def lines_of(file: Path) -> list[str]:
+    """Return the lines of a file of /proc, whose paths may have any bytes; []: it is not there."""
+    try:
+        return os.fsdecode(file.read_bytes()).split("\n")[:-1]
+    except OSError:
+        return []
 
 
 def _unescaped(path: str) -> str:

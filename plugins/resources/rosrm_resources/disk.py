@@ -12,6 +12,7 @@ from typing import Annotated, Final
 from annotated_types import Gt
 
 from rosrm import ProbeContext, Sessions
+from rosrm_resources.cgroups import lines_of
 from rosrm_resources.gauge import GaugeProbe, Scope, budget
 
 #: Largest fraction of the time that walks through the directory may take.
@@ -182,7 +183,7 @@ def _fields(path: str) -> dict[str, str]:
 
 def _devices(pid: int | str) -> dict[str, str]:
     """Return mount id to device number of the mounts that a process sees."""
-    lines = Path(f"/proc/{pid}/mountinfo").read_text(errors="replace").splitlines()
+    lines = lines_of(Path(f"/proc/{pid}/mountinfo"))
     return {fields[0]: fields[2] for fields in (line.split(" ", 3) for line in lines)}
 
 

@@ -176,6 +176,28 @@ def test_an_agent_beside_other_processes_stays_and_says_why(group: str, tmp_path
     assert not Path(group, "rosrm-agent").exists()
 
 
+def test_a_mount_whose_path_is_not_utf8_changes_nothing(tmp_path: Path) -> None:
+    """A USB stick with such a name ended the slave at its start."""
+    disk = tmp_path / os.fsdecode(b"caf\xe9")
+    disk.mkdir()
+    find = (
+        "from rosrm.runtime import cgroups; from rosrm.supervisor import group_trees; "
+        f"print(len(cgroups.mounts()), group_trees.find({str(tmp_path)!r}).trees)"
+    )
+    words = (sys.executable, find, str(disk))
+    without, beside = (
+        subprocess.run(
+            ["unshare", "--mount", "sh", "-c", f'{first} && exec "$0" -c "$1"', *words],
+            capture_output=True, text=True, check=False, timeout=60,
+        )
+        for first in ("true", 'mount -t tmpfs none "$2"')
+    )  # fmt: skip
+    if without.returncode:
+        pytest.skip(f"no mount namespace can be made: {without.stderr}")
+    assert not beside.returncode, beside.stderr
+    assert beside.stdout == without.stdout
+
+
 def controller() -> str:
     """Return a controller of version 2 that a group with processes cannot give on."""
     mount = next(one for one in cgroups.mounts() if one.version == 2)

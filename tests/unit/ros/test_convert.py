@@ -90,6 +90,16 @@ def test_a_status_about_a_path_of_other_bytes_can_be_sent() -> None:
     assert answer.message == "/opt/caf?/talker"
 
 
+def test_a_host_with_reasons_about_paths_of_other_bytes_can_be_sent() -> None:
+    """Limits that are not enforced name a control group, of which the name may have any bytes."""
+    group = b"/sys/fs/cgroup/caf\xe9".decode(errors="surrogateescape")
+    reason = {"limits.cpu": f"no group below {group}"}
+    host = values.HostDescription("robot", 1, absent=reason, unenforced=reason)
+    received = convert.host_from_msg(over_the_wire(convert.host_to_msg(host)))
+    assert received.unenforced == {"limits.cpu": "no group below /sys/fs/cgroup/caf?"}
+    assert received.absent == received.unenforced
+
+
 @given(drawn(values.InstanceStatus))
 @settings(max_examples=60, deadline=None)
 def test_status_survives(status) -> None:

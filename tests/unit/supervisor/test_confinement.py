@@ -235,6 +235,12 @@ def test_a_host_without_control_groups_says_so(tmp_path: Path) -> None:
     assert found.missing["limits.memory_high"] == found.missing["limits.memory"]
 
 
+@pytest.fixture
+def plain(monkeypatch) -> None:
+    """Let groups be made in plain files."""
+    monkeypatch.setattr(group_trees, "make_top", lambda tree: Path(tree.top).mkdir())
+
+
 def recorded_tree(recorded: str, folder: Path, given: str) -> tuple[str, str]:
     """Copy a recorded tree, with the controllers given to groups below; return root and group."""
     root = folder / "root"
@@ -247,10 +253,63 @@ def recorded_tree(recorded: str, folder: Path, given: str) -> tuple[str, str]:
     return str(root), own
 
 
-def test_a_controller_that_is_not_delegated_is_named(tmp_path: Path, monkeypatch) -> None:
+def add_mounts(root: str, *lines: bytes) -> None:
+    """Add lines to the mounts of a recorded tree."""
+    with Path(root, "proc/self/mountinfo").open("ab") as file:
+        file.writelines(line + b"\n" for line in lines)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b"99 1 8:1 / /media/caf\xe9 rw - ext4 /dev/sdb1 rw",
+        b"99 1 8:1 / /media/a\rb rw - ext4 /dev/sdb1 rw",
+        b"99 1 8:1 / /media/usb rw",
+        b"99 1 - cgroup2",
+    ],
+)
+def test_a_mount_that_cannot_be_read_hides_no_other(line: bytes, tmp_path: Path, plain) -> None:
+    """A path may be of any bytes; such a mount ended the slave before it started."""
+    root, own = recorded_tree("systemd", tmp_path, "memory cpu")
+    before = cgroups.mounts(root)
+    add_mounts(root, line)
+    assert cgroups.mounts(root) == before
+    cgroups.delegate(root)
+    assert group_trees.find(str(tmp_path), root).trees[0].home == own
+
+
+def test_a_group_with_a_name_of_other_bytes_is_used(tmp_path: Path, plain) -> None:
+    """The supervisor makes groups below it."""
+    root, own = recorded_tree("systemd", tmp_path, "memory cpu")
+    other = Path(os.fsdecode(os.fsencode(own) + b"-\xe9"))
+    Path(own).rename(other)
+    path = Path(root, "proc/self/cgroup")
+    path.write_bytes(path.read_bytes().rstrip(b"\n") + b"-\xe9\n")
+    assert group_trees.find(str(tmp_path), root).trees[0].home == str(other)
+
+
+@pytest.mark.parametrize("content", [None, b"", b"nonsense\n", b"0::\n"])
+def test_an_own_group_that_cannot_be_read_is_a_reason(content, tmp_path: Path) -> None:
+    """The group was read again for the text of the reason, which ended the supervisor."""
+    root, _ = recorded_tree("systemd", tmp_path, "memory cpu")
+    path = Path(root, "proc/self/cgroup")
+    path.unlink() if content is None else path.write_bytes(content)
+    cgroups.delegate(root)
+    found = group_trees.find(str(tmp_path), root)
+    assert found.trees == ()
+    assert found.missing["limits.memory"].startswith("no groups can be made below the control ")
+
+
+def test_a_state_directory_that_is_gone_is_a_reason(tmp_path: Path) -> None:
+    """Nothing is enforced, and the supervisor starts."""
+    root, _ = recorded_tree("systemd", tmp_path, "memory cpu")
+    found = group_trees.find(str(tmp_path / "gone"), root)
+    assert "No such file or directory" in found.missing["limits.memory"]
+
+
+def test_a_controller_that_is_not_delegated_is_named(tmp_path: Path, plain) -> None:
     """The other one can be used."""
     root, own = recorded_tree("systemd", tmp_path, "memory")
-    monkeypatch.setattr(group_trees, "make_top", lambda tree: Path(tree.top).mkdir())
     (tree,), missing = group_trees.find(str(tmp_path), root)
     assert (tree.version, tree.controllers, tree.home) == (2, ("memory",), own)
     assert missing.keys() & {"limits.memory", "limits.memory_high"} == set()

@@ -123,6 +123,15 @@ def test_version_1_beside_version_2(tmp_path):
     assert find_group("io", tmp_path).version == 2
 
 
+@pytest.mark.parametrize("path", [b"caf\xe9", b"a\rb", b"a\xc2\x85b"])
+def test_a_mount_with_any_bytes_in_its_path_is_read(tmp_path, path: bytes):
+    """A line ends at a newline alone, which the kernel writes as an escape in a path."""
+    write_proc(tmp_path, "0::/\n", "/cg rw - cgroup2 cgroup2 rw")
+    with (tmp_path / "proc/self/mountinfo").open("ab") as file:
+        file.write(b"4 1 8:1 / /media/%b rw - ext4 /dev/sdb1 rw\n" % path)
+    assert find_group("memory", tmp_path).mount == tmp_path / "cg"
+
+
 def test_memory_of_version_1(tmp_path):
     """Version 1 has other names, and its cache is the total with the groups below."""
     (tmp_path / "memory.usage_in_bytes").write_text("1000000\n")
