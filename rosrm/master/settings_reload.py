@@ -28,7 +28,7 @@ class SettingsReload:
     def __init__(self, config: ClusterConfig, source: SettingsSource, chain_of: ChainOf) -> None:
         self.chain_of = chain_of
         self._config = config
-        self._check = SettingsCheck(source, partial(self._take, 0))
+        self._check = SettingsCheck(source, ClusterConfig.from_json, partial(self._take, 0))
         self.hang_up = self._check.hang_up
         self._read: list[SettingsRead] = []
 
@@ -46,13 +46,12 @@ class SettingsReload:
         """End a check that runs."""
         self._check.close()
 
-    def _take(self, request: int, text: str, fault: str) -> None:
-        self._read.append(self._event(request, text, fault))
+    def _take(self, request: int, new: ClusterConfig | None, fault: str) -> None:
+        self._read.append(
+            SettingsRead(request, fault) if new is None else self._event(request, new)
+        )
 
-    def _event(self, request: int, text: str, fault: str) -> SettingsRead:
-        if fault:
-            return SettingsRead(request, fault)
-        new = ClusterConfig.from_json(text)
+    def _event(self, request: int, new: ClusterConfig) -> SettingsRead:
         same_policies = _policies(new) == _policies(self._config)
         allowed = [one for one in OF_CLUSTER if same_policies or one != "scoring"]
         read = reloaded(self._config, new, allowed)

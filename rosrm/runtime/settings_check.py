@@ -12,14 +12,16 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import IO, Any, Final
+from typing import IO, Any, Final, Generic, TypeVar
 
 from rosrm.model.orders import CHECK_TIMEOUT
 
+Config = TypeVar("Config")
+
 _MODULE: Final = "rosrm.config.rereading"
 
-#: Called with the settings as JSON, and with the reason why the file cannot be used; one is "".
-Checked = Callable[[str, str], None]
+#: Called with the settings, None if the file cannot be used; then with the reason, else "".
+Checked = Callable[[Config | None, str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,26 +39,30 @@ class SettingsSource:
     domain: int | None = None
 
 
-class SettingsCheck:
+class SettingsCheck(Generic[Config]):
     """Reads a settings file again; the runtime calls `poll` until the check has ended.
 
     Args:
         source: origin of the settings.
+        from_json: returns the settings from the JSON that the check prints.
         after_signal: gets the outcome of a check that a signal has requested.
     """
 
-    def __init__(self, source: SettingsSource, after_signal: Checked) -> None:
-        self._source, self._after_signal = source, after_signal
+    def __init__(
+        self, source: SettingsSource, from_json: Callable[[str], Config],
+        after_signal: Checked[Config],
+    ) -> None:  # fmt: skip
+        self._source, self._from_json, self._after_signal = source, from_json, after_signal
         self._hung_up = False
         self._process: subprocess.Popen[bytes] | None = None
-        self._waiting: list[Checked] = []
+        self._waiting: list[Checked[Config]] = []
         self._deadline = 0.0
 
-    def start(self, done: Checked) -> None:
+    def start(self, done: Checked[Config]) -> None:
         """Begin a check, unless one is under way; call `done` with its outcome."""
         if not self._source.path:
             role = self._source.role
-            done("", f"the {role} was started without a file: start it with `--config FILE`")
+            done(None, f"the {role} was started without a file: start it with `--config FILE`")
             return
         self._waiting.append(done)
         if self._process is None:
@@ -104,10 +110,23 @@ class SettingsCheck:
         fault = "" if code == 0 else errors or f"the check ended with exit code {code}"
         self._tell("" if fault else settings, fault)
 
-    def _tell(self, settings: str, fault: str) -> None:
+    def _tell(self, text: str, fault: str) -> None:
+        config = None
+        if not fault:
+            config, fault = self._settings_of(text)
         waiting, self._waiting = self._waiting, []
         for done in waiting:
-            done(settings, fault)
+            done(config, fault)
+
+    def _settings_of(self, text: str) -> tuple[Config | None, str]:
+        """Return the printed settings, or None and why this process cannot read them."""
+        try:
+            return self._from_json(text), ""
+        except Exception as error:  # noqa: BLE001 - another version may print anything
+            return None, (
+                f"the settings in {self._source.path} are valid, but this {self._source.role} "
+                f"cannot read them: {error}. If rosrm was upgraded since its start, restart it"
+            )
 
     def close(self) -> None:
         """End a check that runs."""

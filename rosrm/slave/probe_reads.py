@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 from rosrm.errors import PluginError
@@ -91,11 +92,16 @@ def read_devices(probe: Probe) -> tuple[Device, ...]:
     answer: object = find()
     if not isinstance(answer, Iterable):
         raise PluginError(f"devices() answered {given(answer)}; a list of Devices is required")
-    devices = tuple(required(one, Device) for one in answer)
+    devices = tuple(_plain(required(one, Device)) for one in answer)
     fault = device_fault(devices)
     if fault:
         raise PluginError(f"devices(): {fault}")
     return devices
+
+
+def _plain(device: Device) -> Device:
+    """Return a device of a subclass as one of the class itself, because copies are made of it."""
+    return Device(*(getattr(device, field.name) for field in fields(Device)))
 
 
 def _mapping(answer: object) -> Mapping[Any, Any]:

@@ -84,6 +84,8 @@ _BEATS_MISSED: Final = 3
 #: Seconds in which `--stop-all` looks for the master before it stops the processes.
 _MASTER_PATIENCE: Final = 5.0
 
+#: Takes a summary of reloaded settings, or why they cannot be used; the other one is "".
+ReloadDone = Callable[[str, str], None]
 #: Takes the outcome of an order: the reason of a refusal; "": the order was executed.
 Settled = Callable[[str], None]
 
@@ -104,7 +106,9 @@ class SlaveRuntime:
         self, config: HostConfig, registry: Registry, security: Member, source: SettingsSource
     ) -> None:
         self._config = config
-        self._settings_check = SettingsCheck(source, self._applying(_log_reload))
+        self._settings_check = SettingsCheck(
+            source, HostConfig.from_json, self._applying(_log_reload)
+        )
         self._security = security
         self._incarnation = _random_number()
         self._stopping = ""
@@ -331,7 +335,7 @@ class SlaveRuntime:
                 guard.call(self._starter.look_at_graph, awaited)
             if now >= next_devices:
                 next_devices = now + LOOK_AT_DEVICES
-                self._look_at_devices()
+                guard.call(self._look_at_devices)
             guard.call(self._links.turn, now)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
@@ -366,15 +370,13 @@ class SlaveRuntime:
 
     # --- reload --------------------------------------------------------------------------
 
-    def _reload(self, done: Checked) -> None:
+    def _reload(self, done: ReloadDone) -> None:
         """Read the file of this host again; call `done` with what has changed, or the fault."""
         self._settings_check.start(self._applying(done))
 
-    def _applying(self, done: Checked) -> Checked:
+    def _applying(self, done: ReloadDone) -> Checked[HostConfig]:
         """Return a function that applies checked settings, and calls `done` as in `_reload`."""
-        return lambda text, fault: done(
-            "" if fault else self._apply(HostConfig.from_json(text)), fault
-        )
+        return lambda new, fault: done("" if new is None else self._apply(new), fault)
 
     def _apply(self, new: HostConfig) -> str:
         """Apply the settings that need no restart, and return a summary."""
@@ -382,7 +384,7 @@ class SlaveRuntime:
         self._config = read.config
         self._limit = self._limits()
         self._devices.configured = read.config.devices
-        self._look_at_devices()
+        self._participant.guard.call(self._look_at_devices)
         description = self._description()
         if description != self._endpoint.description:
             self._endpoint.describe_again(description)
@@ -390,7 +392,7 @@ class SlaveRuntime:
 
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
-        self._settings_check.poll()
+        self._participant.guard.call(self._settings_check.poll)
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)

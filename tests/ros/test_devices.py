@@ -28,6 +28,11 @@ from rosrm import Device, ProbeOffer, Reading, ResourceDescription, hookimpl
 
 HERE = Path(__file__).parent
 
+class Odd(str):
+    __hash__ = str.__hash__
+    def __ne__(self, other): raise RuntimeError("no comparison")
+    __eq__ = __ne__
+
 class Finder:
     resources = [ResourceDescription("bays", "1", 2.0)]
     labels = {"bay.model": "X", "rack": "of the probe"}
@@ -36,7 +41,8 @@ class Finder:
     def devices(self):
         there = {one.name for one in HERE.glob("bay*")}
         return [
-            Device("bay", unit, missing="" if f"bay{unit}" in there else "empty") for unit in "01"
+            Device("bay", unit, about=Odd("") if "bay.odd" in there else "",
+                   missing="" if f"bay{unit}" in there else "empty") for unit in "01"
         ]
     def close(self): pass
 
@@ -172,4 +178,21 @@ def test_a_probe_adds_devices_and_labels_to_its_host(make_cluster, bays) -> None
     (bays / "bay1").unlink()
     row = cluster.wait("second", "failed")
     assert row.reason.startswith("unhealthy: bay 1 is missing: empty")
+    assert cluster.wait("first", "running").restarts == 0
+
+
+def test_a_device_that_raises_ends_no_slave(make_cluster, bays) -> None:
+    """The error is logged, also during a reload, and the processes run on."""
+    (bays / "master.yaml").write_text("name: rosrm\n")
+    (bays / "a.yaml").write_text("host: a\nprobes: [memory, cpu, bays]\nlabels: {bay: other}\n")
+    probes = {"memory": {}, "cpu": {}, "bays": {}}
+    cluster = make_cluster(host("a", probes=probes), started=False, liveness=STEADY)
+    cluster.files = {"master": bays / "master.yaml", "a": bays / "a.yaml"}
+    cluster.__enter__()
+    (bays / "bay0").touch()
+    cluster.submit(service("first", devices=(DeviceNeed("bay"),)))
+    cluster.wait("first", "running")
+    (bays / "bay.odd").touch()
+    wait_until(lambda: "no comparison" in cluster.log_of("a"), "the error is logged")
+    assert "a: reloaded labels" in cluster.client.reload()
     assert cluster.wait("first", "running").restarts == 0

@@ -7,20 +7,25 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.core.master.events import SettingsRead
+from rosrm.master.settings_reload import SettingsReload
 from rosrm.runtime.settings_check import SettingsCheck, SettingsSource
 from tests.waiting import wait_until
 
 
-def outcome(source: SettingsSource) -> tuple[str, str]:
+def outcome(source: SettingsSource) -> tuple[Any, str]:
     """Return the settings and the fault of one check."""
-    found: list[tuple[str, str]] = []
-    check = SettingsCheck(source, lambda *_: None)
-    check.start(lambda text, fault: found.append((text, fault)))
+    found: list[tuple[Any, str]] = []
+    kind = ClusterConfig if source.role == "master" else HostConfig
+    check = SettingsCheck(source, kind.from_json, lambda *_: None)
+    check.start(lambda config, fault: found.append((config, fault)))
 
     def is_done() -> bool:
         check.poll()
@@ -36,9 +41,8 @@ def test_a_valid_file_yields_its_settings_with_the_domain_of_the_command_line(
     """So a reload does not count the domain as a difference."""
     path = tmp_path / "cluster.yaml"
     path.write_text("queue: {backfill: true}\nros: {domain: 3}\n")
-    text, fault = outcome(SettingsSource("master", str(path), 7))
+    config, fault = outcome(SettingsSource("master", str(path), 7))
     assert fault == ""
-    config = ClusterConfig.from_json(text)
     assert (config.queue.backfill, config.ros.domain) == (True, 7)
 
 
@@ -46,40 +50,77 @@ def test_an_invalid_file_yields_place_and_allowed_values(tmp_path: Path) -> None
     """As a start with this file does."""
     path = tmp_path / "host.yaml"
     path.write_text("host: h\nlimts: {memory: 0.5}\n")
-    text, fault = outcome(SettingsSource("slave", str(path)))
-    assert text == ""
+    config, fault = outcome(SettingsSource("slave", str(path)))
+    assert config is None
     assert f"{path}:2:1" in fault
     assert "did you mean 'limits'?" in fault
     path.write_text("host: h\nlimits: {memory: 0.5}\n")
-    assert HostConfig.from_json(outcome(SettingsSource("slave", str(path)))[0]).limits["memory"]
+    assert outcome(SettingsSource("slave", str(path)))[0].limits["memory"]
 
 
-def test_what_a_plugin_prints_is_no_part_of_the_settings(tmp_path: Path, monkeypatch) -> None:
+@pytest.fixture
+def imported(tmp_path: Path, monkeypatch) -> Callable[[str], None]:
+    """Return a function that installs a plugin, whose code the check runs at its start."""
+
+    def install(code: str) -> None:
+        folder = tmp_path / "talker-1.dist-info"
+        folder.mkdir()
+        (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: talker\nVersion: 1\n")
+        (folder / "entry_points.txt").write_text("[rosrm]\ntalker = talker\n")
+        (tmp_path / "talker.py").write_text(code)
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+
+    return install
+
+
+def test_what_a_plugin_prints_is_no_part_of_the_settings(tmp_path: Path, imported) -> None:
     """A plugin may print when it is imported, also from C."""
-    folder = tmp_path / "talker-1.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: talker\nVersion: 1\n")
-    (folder / "entry_points.txt").write_text("[rosrm]\ntalker = talker\n")
-    says = "import os\nprint('hello')\nos.write(1, b'hello again')\n"
-    (tmp_path / "talker.py").write_text(says)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    imported("import os\nprint('hello')\nos.write(1, b'hello again')\n")
     path = tmp_path / "host.yaml"
     path.write_text("host: h\n")
-    text, fault = outcome(SettingsSource("slave", str(path)))
-    assert (HostConfig.from_json(text).host, fault) == ("h", "")
+    config, fault = outcome(SettingsSource("slave", str(path)))
+    assert (config.host, fault) == ("h", "")
+
+
+#: Lets a check print what a later version of rosrm might.
+_LATER = """
+from rosrm.config.settings import ClusterConfig, HostConfig
+ClusterConfig.to_json = HostConfig.to_json = lambda self: '{"colour": "red"}'
+"""
+
+
+def test_settings_of_another_version_are_a_fault_of_the_reload(tmp_path: Path, imported) -> None:
+    """Such as after an upgrade of rosrm; they ended a slave, and the master."""
+    imported(_LATER)
+    path = tmp_path / "settings.yaml"
+    path.write_text("host: h\n")
+    config, fault = outcome(SettingsSource("slave", str(path)))
+    assert config is None
+    assert fault.startswith(f"the settings in {path} are valid, but this slave cannot read them: ")
+    assert "colour" in fault
+    assert fault.endswith("If rosrm was upgraded since its start, restart it")
+
+    path.write_text("name: n\n")
+    reload = SettingsReload(ClusterConfig(), SettingsSource("master", str(path)), lambda _: None)
+    reload.start(7)
+    read: list[SettingsRead] = []
+    wait_until(lambda: read.extend(reload.poll()) or read, "the file was read")
+    (event,) = read
+    assert (event.request, event.settings) == (7, None)
+    assert "this master cannot read them" in event.fault
 
 
 def test_a_check_that_cannot_be_started_is_a_fault(tmp_path: Path, monkeypatch) -> None:
     """The runtime keeps its settings, and can check the file later."""
     path = tmp_path / "host.yaml"
     path.write_text("host: h\n")
-    source, found = SettingsSource("slave", str(path)), list[tuple[str, str]]()
-    check = SettingsCheck(source, lambda *_: None)
+    source, found = SettingsSource("slave", str(path)), list[tuple[Any, str]]()
+    check = SettingsCheck(source, HostConfig.from_json, lambda *_: None)
     with monkeypatch.context() as limited:
         limited.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
         check.start(lambda *answer: found.append(answer))
-    ((text, fault),) = found
-    assert text == ""
+    ((config, fault),) = found
+    assert config is None
     assert fault.startswith(f"the check of {path} cannot be started: ")
     check.start(lambda *answer: found.append(answer))
     wait_until(lambda: check.poll() or found[1:], "the check has ended")
@@ -89,7 +130,7 @@ def test_a_check_that_cannot_be_started_is_a_fault(tmp_path: Path, monkeypatch) 
 def test_a_runtime_without_a_file_has_nothing_to_read() -> None:
     """The answer says how to start it with one."""
     assert outcome(SettingsSource("slave")) == (
-        "", "the slave was started without a file: start it with `--config FILE`",
+        None, "the slave was started without a file: start it with `--config FILE`",
     )  # fmt: skip
 
 

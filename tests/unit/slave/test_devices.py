@@ -89,6 +89,20 @@ def test_a_probe_that_cannot_read_still_says_which_devices_are_there() -> None:
     sampler.close()
 
 
+def test_a_device_of_a_subclass_is_copied_as_a_device(tmp_path: Path) -> None:
+    """The slave makes copies of devices, which a subclass with another signature refuses."""
+
+    class Camera(Device):
+        def __init__(self) -> None:
+            super().__init__("camera", "front", str(tmp_path / "gone"))
+
+    sampler = sampled(Finder([Camera()]))
+    watch = DeviceWatch({})
+    watch.look(sampler.devices)
+    sampler.close()
+    assert [one.title for one in watch.devices if one.missing] == ["camera front"]
+
+
 def test_a_missing_unit_of_a_kind_with_very_many_units_has_a_short_reason() -> None:
     """The master would refuse a longer one, with the whole report."""
     units = tuple(Device("gpu", f"{number:064}") for number in range(200))
