@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from rosrm.model.description_checks import name_fault
 from rosrm.model.values import LARGEST_RATE
@@ -24,6 +24,7 @@ MOST_KEY_BYTES: Final = 32
 LONGEST_ROUND_TRIP: Final = 10.0
 #: Seconds for which a slave waits for answers of other hosts.
 MEASURE_SECONDS: Final = 3.0
+_Entry = TypeVar("_Entry")
 _PART: Final = "(25[0-5]|2[0-4][0-9]|1[0-9]{2}|[1-9]?[0-9])"
 _ADDRESS: Final = re.compile(rf"({_PART}\.){{3}}{_PART}")
 
@@ -94,24 +95,28 @@ class LinkReport:
         }
 
 
-def report_from_json(plain: Mapping[str, Any]) -> LinkReport:
-    """Return the inverse of `LinkReport.to_json`; raise `ValueError` for an impossible value."""
+def report_from_json(plain: Mapping[str, Any]) -> tuple[LinkReport, list[str]]:
+    """Return the inverse of `LinkReport.to_json`, and why entries of it are left out.
+
+    The rate of an interface that is left out is unknown, because peers refer to it by its number.
+
+    Raises:
+        ValueError: the report cannot be read.
+    """
+    left = _LeftOut([])
     try:
-        interfaces = tuple(
-            Interface(_rate(rate, "a link rate"), _number(traffic, "traffic", LARGEST_RATE))
-            for rate, traffic in _some(plain["interfaces"], INTERFACES, "interfaces")
-        )
-        peers = {
-            int(peer): (_index(at, len(interfaces)), _trip(trip))
-            for peer, (at, trip) in _some(plain["peers"].items(), MOST_PEERS, "peers")
-        }
-        flows = {
-            int(number): {
-                str(node): _number(rate, "the rate of a flow", LARGEST_RATE)
-                for node, rate in rates.items()
-            }
-            for number, rates in _some(plain["flows"].items(), MOST_FLOWS, "flows")
-        }
+        given = left.some(plain["interfaces"], INTERFACES, "interfaces")
+        interfaces = tuple(left.valid(_interface, one) or Interface(math.nan) for one in given)
+        peers = dict(
+            left.all_valid(lambda one: _measured_peer(one, len(interfaces)),
+                           left.some(plain["peers"].items(), MOST_PEERS, "peers"))
+        )  # fmt: skip
+        flows: dict[int, dict[str, float]] = {}
+        given = [
+            (number, *flow) for number, rates in plain["flows"].items() for flow in rates.items()
+        ]
+        for number, node, rate in left.all_valid(_flow, left.some(given, MOST_FLOWS, "flows")):
+            flows.setdefault(number, {})[node] = rate
         addresses = tuple(_some(plain["addresses"], MOST_ADDRESSES, "addresses"))
         port, limit = plain["port"], _number(plain["limit"], "the limit", 1.0)
         is_complete = _is_place(addresses, port)
@@ -119,7 +124,59 @@ def report_from_json(plain: Mapping[str, Any]) -> LinkReport:
         raise ValueError(f"it is malformed ({type(error).__name__})") from None
     if not is_complete:
         raise ValueError(f"it has an impossible address or port: {addresses!r:.200}, {port!r:.50}")
-    return LinkReport(addresses, port, limit, interfaces, peers, flows)
+    return LinkReport(addresses, port, limit, interfaces, peers, flows), left.faults
+
+
+@dataclass(frozen=True, slots=True)
+class _LeftOut:
+    """Entries of a report that are left out.
+
+    Attributes:
+        faults: the reason of each entry, or of several beyond a bound.
+    """
+
+    faults: list[str]
+
+    def some(self, given: Iterable[_Entry], most: int, what: str) -> list[_Entry]:
+        """Return the first entries; a reason stands for those beyond a bound."""
+        found = list(given)
+        if len(found) > most:
+            self.faults.append(f"it has {len(found)} {what}; at most {most}")
+        return found[:most]
+
+    def valid(self, read: Callable[[Any], _Entry], given: Any) -> _Entry | None:
+        """Return an entry; None: it is left out."""
+        try:
+            return read(given)
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as fault:
+            self.faults.append(str(fault))
+            return None
+
+    def all_valid(self, read: Callable[[Any], _Entry], given: Iterable[Any]) -> Iterator[_Entry]:
+        """Yield the entries that are not left out."""
+        for one in given:
+            entry = self.valid(read, one)
+            if entry is not None:
+                yield entry
+
+
+def _interface(given: Any) -> Interface:
+    rate, traffic = given
+    return Interface(_rate(rate, "a link rate"), _number(traffic, "traffic", LARGEST_RATE))
+
+
+def _measured_peer(given: Any, interfaces: int) -> tuple[int, tuple[int, float]]:
+    peer, (at, trip) = given
+    return int(peer), (_index(at, interfaces), _trip(trip))
+
+
+def _flow(given: Any) -> tuple[int, str, float]:
+    number, node, rate = given
+    return (
+        int(number),
+        str(node),
+        _number(rate, f"the rate of a flow from {node!s:.200}", LARGEST_RATE),
+    )
 
 
 def peer_to_json(peer: LinkPeer) -> dict[str, Any]:

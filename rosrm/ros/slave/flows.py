@@ -3,21 +3,28 @@
 A sample subscribes to a topic until two messages have come: their numbers and time stamps give the
 rate, their sizes the bytes. So a topic of 30 MB/s costs a few messages, once in `_RENEWED` seconds.
 After a sample the next one waits until the CPU time of the slave in it is a hundredth of the time.
+A topic without a message in its newest sample has no rate, and neither has a topic to which the
+node does not subscribe any more.
 
 Left out are services, topics with several publishers, and types that are not installed here.
 """
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rclpy.node import Node
 
+from rosrm.model.links import MOST_FLOWS
+from rosrm.model.values import LARGEST_RATE
 from rosrm.ros import qos
 from rosrm.ros.polling import message_type, polled_subscription, waiting
+
+_log = logging.getLogger("rosrm.slave")
 
 #: Largest part of a core that the slave uses for samples.
 SHARE: Final = 0.01
@@ -83,17 +90,35 @@ class FlowSampler:
         self._next_at = 0.0
         self._rates: dict[_Key, tuple[str, float]] = {}
         self._sampled_at: dict[_Key, float] = {}
+        self._has_logged = False
 
     def rates(self) -> dict[int, dict[str, float]]:
-        """Return what each instance receives, bytes a second by the full name of the publisher."""
-        found: dict[int, dict[str, float]] = {}
+        """Return what each instance receives, bytes a second by the full name of the publisher.
+
+        The master accepts MOST_FLOWS flows of at most LARGEST_RATE: smaller flows beyond are left
+        out, and a greater rate, as of a publisher with wrong time stamps, is reported as that.
+        """
+        flows: dict[tuple[int, str], float] = {}
         for (number, _), (publisher, rate) in self._rates.items():
-            received = found.setdefault(number, {})
-            received[publisher] = received.get(publisher, 0.0) + rate
-        return {
-            number: {node: float(f"{rate:.{_DIGITS}g}") for node, rate in rates.items()}
-            for number, rates in found.items()
-        }
+            flows[number, publisher] = flows.get((number, publisher), 0.0) + rate
+        largest = sorted(flows, key=lambda flow: -flows[flow])
+        if len(largest) > MOST_FLOWS or any(rate > LARGEST_RATE for rate in flows.values()):
+            self._log_bounds(largest, flows)
+        found: dict[int, dict[str, float]] = {}
+        for number, publisher in largest[:MOST_FLOWS]:
+            rate = min(flows[number, publisher], LARGEST_RATE)
+            found.setdefault(number, {})[publisher] = float(f"{rate:.{_DIGITS}g}")
+        return found
+
+    def _log_bounds(self, largest: list[tuple[int, str]], flows: Mapping[Any, float]) -> None:
+        """Log once that flows are left out, or that a rate is too great."""
+        if not self._has_logged:
+            self._has_logged = True
+            _log.info(
+                "flows: of %d only the %d largest are reported, and no rate above %g B/s; the "
+                "largest one is of %s: %g B/s",
+                len(flows), MOST_FLOWS, LARGEST_RATE, largest[0][1], flows[largest[0]],
+            )  # fmt: skip
 
     def look(self, nodes: Mapping[int, str]) -> None:
         """Take the next step of a sample, or begin the next one.
@@ -101,18 +126,18 @@ class FlowSampler:
         Args:
             nodes: number of each instance to the full name of its node.
         """
-        for key in [key for key in self._sampled_at if key[0] not in nodes]:
-            self._rates.pop(key, None)
-            del self._sampled_at[key]
+        self._forget(key for key in self._sampled_at if key[0] not in nodes)
         if self._sample is not None:
             self._go_on(self._sample)
         elif self._clock() >= self._next_at and nodes:
             # The node is made once. Its CPU time, as much as that of many samples, counts for none.
             self._node = self._node or self._make_node()
             began, cpu = self._clock(), self._cpu()
-            self._begin(self._node, nodes, began, cpu)
-            if self._sample is None:
-                self._wait(cpu)
+            try:
+                self._begin(self._node, nodes, began, cpu)
+            finally:  # an error of the middleware must not let the next sample begin at once
+                if self._sample is None:
+                    self._wait(cpu)
 
     def close(self) -> None:
         """End the sample."""
@@ -124,6 +149,11 @@ class FlowSampler:
         """Let the next sample begin when the CPU time since `cpu` is a small part of the time."""
         self._next_at = self._clock() + max(_PAUSE, (self._cpu() - cpu) / SHARE)
 
+    def _forget(self, keys: Iterable[_Key]) -> None:
+        for key in list(keys):
+            self._rates.pop(key, None)
+            del self._sampled_at[key]
+
     def _begin(self, node: Node, nodes: Mapping[int, str], now: float, cpu: float) -> None:
         """Begin a sample of the topic that was sampled longest ago, if it is due."""
         due = [
@@ -131,6 +161,7 @@ class FlowSampler:
             for number, name in nodes.items()
             for topic, kind in _subscribed(node, name)
         ]
+        self._forget(self._sampled_at.keys() - {(number, topic) for _, number, topic, _ in due})
         at, number, topic, kind = min(due, default=(now, 0, "", ""))
         if now - at < _RENEWED:
             return
@@ -159,8 +190,11 @@ class FlowSampler:
             assert self._node is not None
             self._node.destroy_subscription(sample.subscription)
             self._sample = None
-            if sample.key in self._sampled_at:  # the instance has not ended since
-                self._rates[sample.key] = (sample.publisher, sample.rate(now))
+            rate = sample.rate(now)
+            if not rate:
+                self._rates.pop(sample.key, None)
+            elif sample.key in self._sampled_at:  # the instance has not ended since
+                self._rates[sample.key] = (sample.publisher, rate)
             self._wait(sample.cpu)
 
 

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 
 from rosrm.core.master.hosts.links import PROBES
+from rosrm.core.master.state.flows import Flows, Partner
 from rosrm.core.master.state.links import MOST_HOSTS, Crossing, LinkTable
 from rosrm.model.links import Interface, LinkReport, report_from_json
 from rosrm.model.orders import MeasureLinks
@@ -114,19 +115,9 @@ def test_no_link_is_measured_with_a_period_of_0() -> None:
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"interfaces": [[math.nan, 0.0]]}, "a link rate is nan; allowed: 0 to 1e+15"),
-        ({"interfaces": [[-5.0, 0.0]]}, "a link rate is -5.0"),
-        ({"interfaces": [[0.0, 0.0]]}, "a link rate is 0; it must be greater"),
-        ({"interfaces": [["fast", 0.0]]}, "a link rate is 'fast'"),
-        ({"interfaces": [[1.0, math.inf]]}, "traffic is inf"),
-        ({"interfaces": [[1.0, 0.0]] * 9}, "it has 9 interfaces; at most 8"),
         ({"interfaces": 5}, "it is malformed (TypeError)"),
-        ({"peers": {"1": [3, 0.1]}}, "interface 3 does not exist; there are 1"),
-        ({"peers": {"1": [0, math.nan]}}, "a round trip is nan"),
-        ({"peers": {"1": [0, 60.0]}}, "a round trip is 60.0; allowed: 0 to 10"),
+        ({"peers": [1]}, "it is malformed (AttributeError)"),
         ({"limit": 2.0}, "the limit is 2.0; allowed: 0 to 1"),
-        ({"flows": {"1": {"/camera": math.nan}}}, "the rate of a flow is nan"),
-        ({"flows": {"x": {}}}, "invalid literal"),
         ({"addresses": ["10.0.0.256"]}, "it has an impossible address or port"),
         ({"addresses": ["example.org"]}, "it has an impossible address or port"),
         ({"port": 70000}, "it has an impossible address or port"),
@@ -144,15 +135,68 @@ def test_an_impossible_report_is_refused_as_a_whole(changes: dict[str, Any], why
     assert np.isnan(cluster.state.hosts.links.rate[0]).all()
 
 
+GOOD = Interface(5 * MB, 100.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"interfaces": [[math.nan, 0.0]]}, "a link rate is nan; allowed: 0 to 1e+15"),
+        ({"interfaces": [[-5.0, 0.0]]}, "a link rate is -5.0"),
+        ({"interfaces": [[0.0, 0.0]]}, "a link rate is 0; it must be greater"),
+        ({"interfaces": [["fast", 0.0]]}, "a link rate is 'fast'"),
+        ({"interfaces": [[1.0, math.inf]]}, "traffic is inf"),
+        ({"interfaces": [[1.0]]}, "not enough values"),
+        ({"interfaces": [[1.0, 0.0]] * 9}, "it has 11 interfaces; at most 8"),
+        ({"peers": {"2": [2, 0.1]}}, "interface 2 does not exist; there are 2"),
+        ({"peers": {"2": [0, math.nan]}}, "a round trip is nan"),
+        ({"peers": {"2": [0, 60.0]}}, "a round trip is 60.0; allowed: 0 to 10"),
+        ({"peers": {"two": [0, 0.1]}}, "invalid literal"),
+        ({"peers": {str(one): [0, 0.1] for one in range(10, 27)}}, "it has 18 peers; at most 16"),
+        ({"flows": {"1": {"/camera": math.nan}}}, "the rate of a flow from /camera is nan"),
+        ({"flows": {"1": {"/camera": 2e15}}}, "the rate of a flow from /camera is 20000000000"),
+        ({"flows": {"x": {"/camera": 1.0}}}, "invalid literal"),
+        ({"flows": {"1": {f"/{one}": 1.0 for one in range(513)}}}, "it has 514 flows; at most 512"),
+    ],
+)  # fmt: skip
+def test_an_impossible_entry_is_left_out_of_a_report(changes: dict[str, Any], why: str) -> None:
+    """All others count; before, one of them discarded what the host had measured."""
+    report = LinkReport(
+        ("10.0.0.1",), 4000, 0.5, (GOOD, GOOD), {3: (1, 0.01)}, {7: {"/lidar": 2.0}}
+    )
+    plain = report.to_json()
+    for key, added in changes.items():
+        plain[key] = [*plain[key], *added] if key == "interfaces" else {**plain[key], **added}
+    found, (fault, *_) = report_from_json(plain)
+    assert why in fault
+    assert GOOD in found.interfaces
+    assert (found.peers[3], found.flows[7]) == ((1, 0.01), {"/lidar": 2.0})
+    assert all(math.isnan(one.rate) or one.rate > 0.0 for one in found.interfaces)
+
+
+def test_entries_that_are_left_out_are_counted_and_named() -> None:
+    """At most once in a while for each host, because it reports every ten seconds."""
+    flows = {"1": {"/x": -1.0, "/y": "fast", "/z": 1.0}}
+    cluster = Cluster(measuring("a", flows=flows), **SETTINGS)
+    cluster.wait(5.0)
+    (line,) = cluster.recorded("reading_refused")
+    assert line == (
+        "2 entries left out of a report of a on its links: the rate of a flow from /x is "
+        "-1.0; allowed: 0 to 1e+15; the rate of a flow from /y is 'fast'; allowed: 0 to 1e+15"
+    )
+    assert cluster.state.hosts.links.rate[0, 0] == 5 * MB
+
+
 @given(drawn(LinkReport))
 def test_any_report_is_refused_or_survives(report: LinkReport) -> None:
-    """A report that is accepted is the same after JSON."""
+    """A report that is accepted as a whole is the same after JSON."""
     plain = report.to_json()
     try:
-        again = report_from_json(plain)
+        again, faults = report_from_json(plain)
     except ValueError:
         return
-    assert again.to_json() == plain
+    plain["flows"] = {number: flows for number, flows in plain["flows"].items() if flows}
+    assert faults or again.to_json() == plain
 
 
 def test_a_report_names_hosts_that_do_not_exist() -> None:
@@ -234,7 +278,7 @@ def test_a_host_reports_flows_of_its_own_instances_only() -> None:
 
 
 def test_a_learned_flow_survives_a_restart_and_ends_with_its_process() -> None:
-    """The process keeps its name, and so its flows, until it ends."""
+    """The next slave, or instance, needs minutes to measure it again."""
     flows: dict[int, dict[str, float]] = {}
     cluster = Cluster(measuring("a", flows), **SETTINGS)
     cluster.submit(node("camera"), node("viewer"))
@@ -246,6 +290,52 @@ def test_a_learned_flow_survives_a_restart_and_ends_with_its_process() -> None:
     cluster.cancel("camera")
     cluster.wait(2.0)
     assert learned(cluster, "viewer") == {}
+
+
+def test_a_flow_that_is_not_measured_any_more_stops_counting_after_ten_minutes() -> None:
+    """Its subscription is gone, or its topic is silent; other flows of the process stay."""
+    flows: dict[int, dict[str, float]] = {}
+    cluster = Cluster(measuring("a", flows), **SETTINGS)
+    cluster.submit(node("camera"), node("lidar"), node("viewer"), node("logger"))
+    for name in ("camera", "lidar", "viewer", "logger"):
+        cluster.discover(name, on="a")
+    viewer, logger = cluster["viewer"].owner, cluster["logger"].owner
+    flows |= {viewer: {"/camera": 2 * MB, "/lidar": 5.0}, logger: {"/camera": 3.0}}
+    cluster.wait(3.0)
+    flows[viewer] = {"/camera": 0.0, "/lidar": 5.0}
+    del flows[logger]
+    cluster.wait(590.0, tick=1.0)
+    assert learned(cluster, "viewer") == {"camera": 2 * MB, "lidar": 5.0}
+    assert learned(cluster, "logger") == {"camera": 3.0}
+    cluster.wait(20.0, tick=1.0)
+    assert learned(cluster, "viewer") == {"lidar": 5.0}
+    assert learned(cluster, "logger") == {}
+
+
+def test_a_learned_flow_counts_after_a_long_wait_until_it_could_be_measured_again() -> None:
+    """The ten minutes begin with the assignment of the process to its next host."""
+    flows = Flows()
+    flows.learn("viewer", {"camera": 5.0}, now=0.0, since=0.0)
+    flows.learn("viewer", {}, now=9_000.0, since=8_500.0)
+    assert flows.between("viewer", "camera").rate == 5.0
+    flows.learn("viewer", {}, now=9_100.0, since=8_500.0)
+    assert (flows.between("viewer", "camera").rate, flows.partners) == (0.0, {})
+
+
+def test_the_size_of_the_cluster_does_not_discard_what_a_host_measured() -> None:
+    """A peer beyond the largest table is left out."""
+    table = LinkTable()
+    table.store(0, [Interface(10.0)], 1.0, {1: (0, 0.1), MOST_HOSTS: (0, 0.1)})
+    assert (table.rate[0, 0], table.interface[0, 1]) == (10.0, 0)
+
+
+@pytest.mark.parametrize("names", [("a", "b"), ("b", "a")])
+def test_a_flow_that_both_declare_is_one_flow_of_the_greater_rate(names: tuple[str, str]) -> None:
+    """Seen from either side; otherwise one of them could overload a link that it shares."""
+    flows = Flows()
+    flows.declare("a", {"b": 10.0})
+    flows.declare("b", {"a": 1.0})
+    assert flows.between(*names) == Partner(10.0, names == ("a", "b"))
 
 
 def test_a_learned_flow_counts_as_at_most_half_a_link() -> None:

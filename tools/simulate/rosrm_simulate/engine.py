@@ -176,7 +176,7 @@ class Simulation(World[Machine]):
             if one.link is not None:
                 interfaces = (Interface(one.link.rate),)
                 report = LinkReport(limit=one.link.limit, interfaces=interfaces, peers=trips)
-                note_report(self.state, table.by_name[one.name], report)
+                note_report(self.state, table.by_name[one.name], report, self.now)
 
     def _leave(self, plan: SimulatedHost) -> None:
         machine = self.machines[plan.name]

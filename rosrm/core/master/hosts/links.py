@@ -5,7 +5,9 @@ observed                        action
 ==============================  =============================================================
 `link_period` after the last    `MeasureLinks` with the next peers of the host; one host in
 measurement of a host           each tick, and at most PROBES peers a second in all
-the slave has answered          the report replaces what was known of the host
+the slave has answered          the report replaces what was known of the host; entries that
+                                cannot be are left out, and recorded; a flow that is not
+                                reported for `LEARNED_FOR` stops counting
 no answer in time               the order is repeated after `link_period`
 the slave refuses the order     the host is asked again when it registers
 ==============================  =============================================================
@@ -15,6 +17,7 @@ Nothing is persisted: slaves measure again.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 from rosrm.core.master import events as happened
@@ -26,6 +29,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.links import LinkPeer, LinkReport, report_from_json
 from rosrm.model.orders import MeasureLinks
 from rosrm.model.values import EMPTY, qualified_name
+from rosrm.wording import counted, few
 
 #: Most peers of one measurement, and most peers in a second of all measurements.
 _PEERS: Final = 4
@@ -65,15 +69,19 @@ def note_answer(state: MasterState, name: str, event: happened.OrderAnswered, no
             state.link_queries.remove(name)
         return
     try:
-        report = report_from_json(event.result or EMPTY)
+        report, faults = report_from_json(event.result or EMPTY)
     except ValueError as fault:
         why = f"a report of {name} on its links was refused: {fault}"
         state.record_seldom(host, EventKind.READING_REFUSED, now, why)
         return
-    note_report(state, host, report)
+    if faults:
+        entries, reasons = counted(len(faults), "entry", "entries"), "; ".join(few(faults, 3))
+        why = f"{entries} left out of a report of {name} on its links: {reasons}"
+        state.record_seldom(host, EventKind.READING_REFUSED, now, why)
+    note_report(state, host, report, now)
 
 
-def note_report(state: MasterState, host: Host, report: LinkReport) -> None:
+def note_report(state: MasterState, host: Host, report: LinkReport, now: float) -> None:
     """Store what a host has measured."""
     table = state.hosts
     if report.port:
@@ -83,25 +91,37 @@ def note_report(state: MasterState, host: Host, report: LinkReport) -> None:
         if 0 < host_id <= len(table) and host_id != host.host_id
     }  # fmt: skip
     table.links.store(host.column, report.interfaces, report.limit, peers)
-    if report.flows:
-        _learn(state, host, report)
+    _learn(state, host, report.flows, now)
     table.changed()
 
 
-def _learn(state: MasterState, host: Host, report: LinkReport) -> None:
-    """Store what the instances of a host receive from nodes, by the processes of the nodes."""
-    nodes = _process_of_node(state)
-    for number, rates in report.flows.items():
+def _learn(
+    state: MasterState, host: Host, flows: Mapping[int, Mapping[str, float]], now: float
+) -> None:
+    """Store what the processes of a host receive from others."""
+    received = _received(state, host, flows) if flows else {}
+    for name in {**received, **state.flows.learned}:
+        owner = state.instances.get(state.processes[name].owner)
+        if owner is not None and owner.host is host:
+            state.flows.learn(name, received.get(name, EMPTY), now, owner.since)
+
+
+def _received(
+    state: MasterState, host: Host, flows: Mapping[int, Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """Return what the processes of a host receive from nodes, by the processes of the nodes."""
+    nodes, found = _process_of_node(state), dict[str, dict[str, float]]()
+    for number, rates in flows.items():
         instance = state.instances.get(number)
         process = state.owned_by(instance) if instance is not None else None
         if instance is None or process is None or instance.host is not host:
             continue
-        received: dict[str, float] = {}
+        received = found.setdefault(process.name, {})
         for node, rate in rates.items():
             sender = nodes.get(node, process.name)
-            if sender != process.name:
+            if sender != process.name and rate > 0.0:
                 received[sender] = received.get(sender, 0.0) + rate
-        state.flows.learn(process.name, received)
+    return found
 
 
 def _process_of_node(state: MasterState) -> dict[str, str]:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from rosrm.model.values import EMPTY
 
+#: Seconds after which a learned flow that is not measured any more stops counting. A slave that
+#: starts again needs minutes to measure all flows, and some topics have messages seldom.
+LEARNED_FOR: Final = 600.0
 #: Two names of processes, in alphabetical order.
 Pair = tuple[str, str]
 
@@ -43,6 +46,7 @@ class Flows:
     def __init__(self) -> None:
         self.declared: dict[str, Mapping[str, float]] = {}
         self.learned: dict[str, Mapping[str, float]] = {}
+        self._measured_at: dict[str, dict[str, float]] = {}
         self.partners: dict[str, dict[str, None]] = {}
         self.changed: dict[Pair, None] = {}
 
@@ -50,18 +54,28 @@ class Flows:
         """Set the flows in the spec of a process."""
         self._replace(self.declared, name, flows)
 
-    def learn(self, name: str, flows: Mapping[str, float]) -> None:
-        """Set what a process receives from others, as measured."""
-        self._replace(self.learned, name, flows)
+    def learn(self, name: str, flows: Mapping[str, float], now: float, since: float) -> None:
+        """Set what a process receives from others, as measured now.
+
+        A flow that was not measured for LEARNED_FOR stops counting; other flows stay.
+
+        Args:
+            since: time of the assignment of its instance; before, its slave could not measure.
+        """
+        at = self._measured_at.setdefault(name, {})
+        at |= dict.fromkeys(flows, now)
+        known = self.learned.get(name, EMPTY)
+        rest = {one: rate for one, rate in known.items() if now - max(at[one], since) < LEARNED_FOR}
+        self._set_learned(name, {**rest, **flows})
 
     def remove(self, name: str) -> None:
         """Remove the flows of a process that has ended; what others declare about it stays."""
         self.declare(name, EMPTY)
-        self.learn(name, EMPTY)
+        self._set_learned(name, EMPTY)
         for other in list(self.partners.get(name, ())):
             if name in self.learned.get(other, EMPTY):
                 rest = {one: rate for one, rate in self.learned[other].items() if one != name}
-                self.learn(other, rest)
+                self._set_learned(other, rest)
 
     def note_change(self, name: str) -> None:
         """Note that an instance of a process was added or has ended, or owns its name now."""
@@ -69,15 +83,25 @@ class Flows:
             self.changed[pair_of(name, other)] = None
 
     def between(self, name: str, other: str) -> Partner:
-        """Return the flow between two processes; what a spec declares replaces what was learned."""
-        own, theirs = self.declared.get(name, EMPTY), self.declared.get(other, EMPTY)
-        if other in own:
-            return Partner(own[other], True)
-        if name in theirs:
-            return Partner(theirs[name], False)
+        """Return the flow between two processes.
+
+        What a spec declares replaces what was learned. If both declare a rate, the greater counts.
+        """
+        own = self.declared.get(name, EMPTY).get(other)
+        theirs = self.declared.get(other, EMPTY).get(name)
+        if own is not None and own >= (theirs or 0.0):
+            return Partner(own, True)
+        if theirs is not None:
+            return Partner(theirs, False)
         received = self.learned.get(name, EMPTY).get(other, 0.0)
         sent = self.learned.get(other, EMPTY).get(name, 0.0)
         return Partner(received + sent, received >= sent, True)
+
+    def _set_learned(self, name: str, flows: Mapping[str, float]) -> None:
+        self._replace(self.learned, name, flows)
+        at = self._measured_at.pop(name, EMPTY)
+        if flows:
+            self._measured_at[name] = {one: at[one] for one in flows}
 
     def _replace(
         self, table: dict[str, Mapping[str, float]], name: str, flows: Mapping[str, float]

@@ -101,9 +101,10 @@ class LinkTable:
             limit: fraction of their rates that flows may use.
             peers: column of another host to the interface and the round trip (NaN: no answer).
         """
-        most = max(column, *peers, 0)
-        if most >= MOST_HOSTS:
+        if column >= MOST_HOSTS:
             return
+        peers = {peer: found for peer, found in peers.items() if peer < MOST_HOSTS}
+        most = max(column, *peers, 0)
         if most >= self.size:
             self._grow(most + 1)
         self.rate[column] = np.nan
