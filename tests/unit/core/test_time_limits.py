@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from rosrm.model.values import RestartPolicy
+import pytest
+
+from rosrm.model.values import HostLossPolicy, RestartPolicy
 from tests.unit.core.cluster import Cluster, job, movable
 
 
@@ -62,6 +64,26 @@ def test_a_move_does_not_begin_the_time_limit_again() -> None:
     assert cluster.where("p") == ["b"]
     cluster.wait(2.5)
     assert cluster.phase("p") == "failed"
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_readopted_job_has_the_rest_of_its_time_limit(restarted: bool) -> None:
+    """The job ran on while its host was lost, also if the master starts again in between."""
+    elsewhere = HostLossPolicy("elsewhere")
+    cluster = Cluster("a", lease=2.0)
+    cluster.submit(job("p", time_limit=20.0, host_loss=elsewhere))
+    cluster.add("b")
+    cluster.set_host("b", "cordon")
+    cluster.wait(5.0)
+    cluster.cut("a", seconds=10.0)
+    assert cluster.phase("p") == "queued"
+    if restarted:
+        cluster.restart_master()
+        cluster.rejoin("a", 0.0)
+    cluster.reconnect("a", seconds=2.0)
+    assert cluster.phase("p") == "running"
+    cluster.wait(5.0)
+    assert cluster["p"].reason == "it ran longer than its time limit of 20 s"
 
 
 def test_the_time_limit_survives_a_restart_of_the_master() -> None:

@@ -149,6 +149,8 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
     before["spec"] = {**again["spec"], **before["spec"]}
     if before["standby"]:
         before["standby"] = {"source_devices": [], **before["standby"]}
+    if before["left_behind"]:
+        before["left_behind"] = [*before["left_behind"], 0.0]  # the start of the process
     changed = {field: (before[field], value) for field, value in again.items()
                if before[field] != value}  # fmt: skip
     if process.phase not in WAITING:

@@ -132,7 +132,9 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
         process=instance.id.process, host=host.name, facts={"number": instance.id.number},
     )  # fmt: skip
     if process is not None and _may_be_readopted(process, instance):
-        process.left_behind = LeftBehind(instance.id.number, host.name, instance.node_name)
+        process.left_behind = LeftBehind(
+            instance.id.number, host.name, instance.node_name, process.began
+        )
     stays = process is not None and process.spec.host_loss.then == "stop"
     lifecycle.gone(state, instance, now, why, requeue=not stays)
 

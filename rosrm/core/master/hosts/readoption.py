@@ -44,6 +44,7 @@ def _readopt(
     # report it.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
     process.owner, process.left_behind = left.number, None
+    process.set_start(left.began, state.wall, now)
     state.set_phase(process, ProcessPhase.STARTING, now)
     state.record(
         now, EventKind.READOPTED, f"{host.name} reports again: {instance.id} still runs there",

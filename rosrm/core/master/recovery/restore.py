@@ -74,8 +74,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
-    if process.began:
-        process.started_at = now - max(0.0, state.wall - process.began)
+    process.set_start(process.began, state.wall, now)
     if not phase.is_terminal:
         process.exit_code = None
     state.add_process(process)

@@ -123,11 +123,16 @@ _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
-    """The owning instance of a process on a lost host, until a successor is assigned."""
+    """The owning instance of a process on a lost host, until a successor is assigned.
+
+    Attributes:
+        began: unix time at which the process first started since it left the queue; 0: it did not.
+    """
 
     number: int
     host: str
     node_name: str = ""
+    began: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -249,3 +254,13 @@ class Process:
     def placed_from(self) -> float:
         """Return the time from which a queued process may be placed."""
         return self.since + self.queue_delay
+
+    def set_start(self, began: float, wall: float, now: float) -> None:
+        """Set the time of its first start, which a former master or a lost host knows.
+
+        Args:
+            began: unix time of the start; 0: it has not started.
+            wall: unix time now; it may be earlier than the start, if the clock was set back.
+        """
+        self.began = began
+        self.started_at = now - max(0.0, wall - began) if began else inf
