@@ -12,7 +12,7 @@ import contextlib
 import errno
 import os
 import signal
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from rosrm.core.supervisor.rules import Key, LimitRule
@@ -45,15 +45,18 @@ class InstanceGroups:
         self._kills_before: dict[Key, int] = {}
         self._emptied: dict[str, float] = {}
 
-    def find_again(self, live: Iterable[Key]) -> None:
+    def find_again(self, live: Mapping[Key, int]) -> None:
         """Find the groups of instances of an earlier supervisor; kill and remove all others.
 
         Groups of supervisors that have ended beside this one, and have no processes, are removed.
+
+        Args:
+            live: each instance that has not ended, with its `kills_before`.
         """
-        for key in live:
+        for key, kills in live.items():
             found = tuple(tree for tree in self.trees if os.path.isdir(_path(tree, key)))
             if found:
-                self._made[key] = found
+                self._made[key], self._kills_before[key] = found, kills
         known = {group_name(key) for key in self._made}
         for tree in self.trees:
             for name in _folders(tree.top) - known:
@@ -127,9 +130,13 @@ class InstanceGroups:
         kill(_path(trees[0], key))
         return True
 
+    def kills_before(self, key: Key) -> int:
+        """Return the number of OOM kills in the group of an instance before its run."""
+        return self._kills_before.get(key, 0)
+
     def out_of_memory(self, key: Key) -> tuple[float, float] | None:
         """Return used bytes and limit (0: none) if the OOM killer ended a process of this run."""
-        if self._kills(key) <= self._kills_before.get(key, 0):
+        if self._kills(key) <= self.kills_before(key):
             return None
         tree = self._memory_tree(key)
         assert tree is not None

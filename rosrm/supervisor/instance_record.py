@@ -4,7 +4,8 @@
     {"record": "environment", "id": ID, "variables": {...}}
     {"record": "order", "instance": ..., "argv": ...}       as in the protocol's `start`
     {"record": "spawning", "instances": [...]}              their spawns are about to be tried
-    {"record": "state", "key": [process, number], "phase": ..., ...}   the fields of `Instance`
+    {"record": "state", "key": [process, number], "birth": ..., "oom_kills": ..., "phase": ..., ...}
+                                                            also the fields of `Instance`
     {"record": "dead", "process": NAME, "number": N}        up to N they never start again
 
 The last line about an item counts. Each line survives the supervisor's own SIGKILL, because one
@@ -54,6 +55,8 @@ class Recorded:
     """The content of a record.
 
     Attributes:
+        births: start time of the leader of each instance, see `procfs.was_born`.
+        kills: number of OOM kills in the control group of each instance before its run.
         spawning: instances whose last spawn may have been tried, with no outcome recorded.
         same_boot: the record was written since this machine's start.
         notes: faults of the record, as text for the user.
@@ -65,6 +68,7 @@ class Recorded:
         self.instances: dict[Key, Instance] = {}
         self.dead: dict[str, int] = {}
         self.births: dict[Key, int] = {}
+        self.kills: dict[Key, int] = {}
         self.spawning: set[Key] = set()
         self.same_boot = False
         self.notes: list[str] = []
@@ -133,9 +137,11 @@ def _take_state(recorded: Recorded, fields: Mapping[str, Any]) -> None:
             setattr(instance, name, reader(fields[name]))
     instance.fence = messages.read_fence(fields.get("fence"))
     birth = messages.read_whole(fields["birth"], 0)
+    kills = messages.read_whole(fields.get("oom_kills", 0), 0)  # absent in older records
     _check(instance)
     recorded.instances[instance.key] = instance
     recorded.births[instance.key] = birth
+    recorded.kills[instance.key] = kills
     recorded.spawning.discard(instance.key)
     if instance.ended:
         recorded.launches.pop(instance.key, None)
@@ -229,10 +235,10 @@ class InstanceRecord:
         """Add the spawns that will be tried next."""
         self._add({"record": "spawning", "instances": list(keys)})
 
-    def state(self, instance: Instance, birth: int) -> None:
-        """Add the whole state of an instance; `birth`: see `procfs.was_born`."""
+    def state(self, instance: Instance, birth: int, kills: int = 0) -> None:
+        """Add the whole state of an instance; `birth` and `kills`: see `Recorded`."""
         fields = {name: getattr(instance, name) for name in Instance.__slots__}
-        self._add({"record": "state", "birth": birth, **fields})
+        self._add({"record": "state", "birth": birth, "oom_kills": kills, **fields})
 
     def dead(self, key: Key, number: int) -> None:
         """Add a forgotten instance; its process starts no number up to `number` any more."""
@@ -264,6 +270,7 @@ class InstanceRecord:
     def rewrite(
         self, core_state: SupervisorState, launches: Mapping[Key, Launch],
         environments: Mapping[str, Mapping[str, str]], birth: Callable[[Key], int],
+        kills: Callable[[Key], int] = lambda _: 0,
     ) -> None:  # fmt: skip
         """Replace the record by one that holds only the current state, if the disk has room.
 
@@ -282,7 +289,7 @@ class InstanceRecord:
         for launch in launches.values():
             self.launch(launch)
         for instance in core_state.instances.values():
-            self.state(instance, birth(instance.key))
+            self.state(instance, birth(instance.key), kills(instance.key))
         text = b"".join(self._waiting)
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * max(self._size, len(text)))
         try:

@@ -176,6 +176,10 @@ class ProcessTrees:
         stats = map(procfs.read_stat, members)
         return [stat for stat in stats if stat is not None and stat.alive]
 
+    def out_of_memory(self, key: Key) -> tuple[float, float] | None:
+        """Return the same as `InstanceGroups.out_of_memory`."""
+        return self._groups.out_of_memory(key)
+
     def _look_at_adopted(self) -> None:
         """Find the instance of each adopted child; kill it if that has no leader."""
         for pid in procfs.own_children():

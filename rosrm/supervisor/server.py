@@ -174,7 +174,7 @@ class Server:
         if not instance.pid and instance.phase != STOPPING:
             self._trees.release(key)
             self._groups.remove(key, time.monotonic())
-        self._record.state(instance, self._trees.birth(key))
+        self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
         self._unsent.append(messages.encode_status(messages.Status.of(instance)))
 
     def _unspawn(self, key: Key) -> None:
@@ -264,7 +264,11 @@ class Server:
     def _take_over(self) -> None:
         recorded = takeover.restore(self._state, self._core, self._trees)
         self._groups.find_again(
-            key for key, instance in self._core.instances.items() if not instance.ended
+            {
+                key: recorded.kills[key]
+                for key, instance in self._core.instances.items()
+                if not instance.ended
+            }
         )
         self._launches.update(recorded.launches)
         self._environments.update(recorded.environments)
@@ -284,7 +288,10 @@ class Server:
             used.add(self._client.environment)  # sent once; later launches refer to it
         for identity in self._environments.keys() - used:
             del self._environments[identity]
-        self._record.rewrite(self._core, self._launches, self._environments, self._trees.birth)
+        self._record.rewrite(
+            self._core, self._launches, self._environments, self._trees.birth,
+            self._groups.kills_before,
+        )  # fmt: skip
 
     # --- the client ---------------------------------------------------------------------------
 

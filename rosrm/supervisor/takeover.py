@@ -91,6 +91,7 @@ def _end_of(instance: Instance, left: list[Stat], trees: ProcessTrees) -> Iterat
     """Yield the events for an instance that ran and whose leader has ended."""
     trees.watch_strays(instance.key, left)
     if instance.pid:
-        yield Exited(instance.key, UNKNOWN_EXIT, leftovers=bool(left))
+        memory = trees.out_of_memory(instance.key)
+        yield Exited(instance.key, UNKNOWN_EXIT, leftovers=bool(left), out_of_memory=memory)
     elif not left:
         yield SessionEnded(instance.key)

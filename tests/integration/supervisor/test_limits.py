@@ -161,6 +161,20 @@ def test_the_next_supervisor_finds_the_groups_again(host, client) -> None:
     assert next(one for one in client.instances if one.pid == pid).enforced == ("limits.memory",)
 
 
+def test_a_kill_while_no_supervisor_runs_is_reported(host, client, tmp_path) -> None:
+    """The next supervisor reads it from the group of the instance."""
+    go = tmp_path / "go"
+    wait = f"import os, time\nwhile not os.path.exists({str(go)!r}): time.sleep(0.01)\n"
+    limits = LimitRule(memory=30 * MB)
+    client.start([host.python("leak", wait + HOG.format(200 * MB), limits=limits)])
+    pid = host.running(client, "leak").pid
+    host.kill_supervisor(client)
+    go.touch()
+    wait_gone(pid)
+    status = host.ended_after_connect(host.connect(), "leak")
+    assert status.message.startswith("killed: used 30.0 MB of 30.0 MB")
+
+
 def test_supervisors_side_by_side_keep_apart(host, client, tmp_path) -> None:
     """Equal names of instances of two supervisors have groups of their own."""
     other = type(host)(tmp_path / "other")

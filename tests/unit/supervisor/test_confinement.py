@@ -224,6 +224,19 @@ def test_kills_of_an_earlier_run_are_not_reported(files) -> None:
     assert groups.out_of_memory(KEY) == (5e8, 0.0)
 
 
+def test_the_next_supervisor_knows_the_kills_of_earlier_runs(files) -> None:
+    """Those before the run are not reported again; those of the run are, whoever watched it."""
+    before, group = files
+    (group / "memory.events").write_text("oom_kill 2\n")
+    before.make(KEY, LimitRule(), realtime=False)
+    for kills, out_of_memory in [(2, False), (3, True)]:
+        (group / "memory.events").write_text(f"oom_kill {kills}\n")
+        after = InstanceGroups(before.trees)
+        after.find_again({KEY: before.kills_before(KEY)})
+        assert (after.out_of_memory(KEY) is not None) is out_of_memory
+        assert after.kills_before(KEY) == 2
+
+
 def test_a_host_without_control_groups_says_so(tmp_path: Path) -> None:
     """Each limit has a reason, which names what is missing."""
     (tmp_path / "proc/self").mkdir(parents=True)

@@ -48,6 +48,19 @@ def test_an_instance_is_restored_in_every_field(tmp_path, core, record):
     assert not recorded.notes
 
 
+def test_the_kills_before_a_run_are_restored(tmp_path, core, record):
+    """A record of an earlier version has none."""
+    record.state(core.instances[TALKER], 55, 3)
+    record.flush()
+    assert rc.read(str(tmp_path)).kills == {TALKER: 3}
+    record.rewrite(core, {}, {}, lambda key: 55, lambda key: 4)
+    assert rc.read(str(tmp_path)).kills == {TALKER: 4}
+    path = tmp_path / "instances.jsonl"
+    path.write_text(path.read_text().replace(',"oom_kills":4', ""))
+    recorded = rc.read(str(tmp_path))
+    assert (recorded.kills, recorded.notes) == ({TALKER: 0}, [])
+
+
 def test_an_amendment_counts_from_then_on(tmp_path, core, record):
     """A confirmed shadow has another policy and environment, also after compaction."""
     amend = Amend(events.AmendOrdered(TALKER, RestartRule("on-failure")), {"ROSRM_SHADOW": None})
