@@ -65,9 +65,7 @@ class Confinement:
         if limits.nice > 0:  # this needs no rights
             faults.pop("nice", None)
         _check_required(limits, faults)
-        made = self.groups.make(key, limits, realtime=bool(limits.policy))
-        own = {name: fault for name, fault in made.items() if name in wanted}
-        _check_required(limits, own)
+        own = self._make_group(key, limits)
         realtime = bool(limits.policy) and "realtime" not in faults
         with _on_cpus(limits.cpus, self._cpus):
             pid, late = self._spawn(key, limits, spawn, realtime)
@@ -81,6 +79,14 @@ class Confinement:
         lacking = sorted(set(limits.cpus) - self._cpus)
         if lacking:
             raise SpawnError(f"this host has no {cpus_in_words(lacking)} for its processes")
+
+    def _make_group(self, key: Key, limits: LimitRule) -> dict[str, str]:
+        """Make the group of an instance; return its limits that do not hold, with the reasons."""
+        made = self.groups.make(key, limits, realtime=bool(limits.policy))
+        wanted = _wanted(limits)
+        faults = {name: fault for name, fault in made.items() if name in wanted}
+        _check_required(limits, faults)
+        return faults
 
     def _spawn(
         self, key: Key, limits: LimitRule, spawn: Spawn, realtime: bool
@@ -101,15 +107,15 @@ class Confinement:
         self, key: Key, limits: LimitRule, spawn: Spawn, scheduler: Scheduler | None
     ) -> tuple[int, dict[str, str]]:
         """Spawn the process in its group, or without one if no process can enter it."""
-        fault = ""
+        fault, faults = "", dict[str, str]()
         for _ in range(_ATTEMPTS):
             try:
                 with self.groups.inside(key) as group:
-                    return spawn(group, scheduler), {}
+                    return spawn(group, scheduler), faults
             except OSError as error:
                 fault = f"its control group cannot be entered: {error.strerror}"
                 # A supervisor beside this one may have removed the group, because it was empty.
-                self.groups.make(key, limits, realtime=bool(limits.policy))
+                faults = self._make_group(key, limits)
         faults = {name: fault for name in _wanted(limits) if name.startswith("limits.")}
         _check_required(limits, faults)
         self.groups.remove(key, 0.0)

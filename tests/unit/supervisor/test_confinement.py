@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -147,6 +148,23 @@ def test_a_group_that_was_removed_is_made_again(confinement) -> None:
     assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (7, ("limits.memory",), "")
 
 
+@pytest.mark.parametrize("required", [True, False])
+def test_a_group_that_is_made_again_without_its_limits_is_noted(
+    confinement, monkeypatch, required: bool
+) -> None:
+    """Otherwise a limit that does not hold would be reported as enforced."""
+    made = [{}, {"limits.memory": "memory.max cannot be written"}]
+    confinement.groups = Closed(1)
+    monkeypatch.setattr(confinement.groups, "make", lambda *_, **__: made.pop(0))
+    limits = LimitRule(memory=1e8, cpu=1.0, required=required)
+    if required:
+        with pytest.raises(SpawnError, match=r"enforce limits\.memory: memory\.max cannot be"):
+            confinement.start(KEY, limits, not_started)
+    else:
+        note = "limits.memory: memory.max cannot be written"
+        assert confinement.start(KEY, limits, in_group) == (7, ("limits.cpu",), note)
+
+
 def test_a_group_that_no_process_can_enter_is_left_out(confinement) -> None:
     """The process runs without, unless its limits are required."""
     confinement.groups = Closed(9)
@@ -222,6 +240,14 @@ def test_kills_of_an_earlier_run_are_not_reported(files) -> None:
     assert groups.out_of_memory(KEY) == (5e8, 5e8)
     (group / "memory.max").write_text("max\n")
     assert groups.out_of_memory(KEY) == (5e8, 0.0)
+
+
+def test_an_unlimited_niceness_is_not_missing(tmp_path: Path, monkeypatch) -> None:
+    """`ulimit -e unlimited` is -1 to Python."""
+    monkeypatch.setattr(group_trees, "_CAP_SYS_NICE", 0)
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (resource.RLIM_INFINITY,) * 2)
+    missing = group_trees.find(str(tmp_path), str(tmp_path)).missing
+    assert missing.keys() & {"nice", "realtime"} == set()
 
 
 def test_the_next_supervisor_knows_the_kills_of_earlier_runs(files) -> None:
