@@ -454,6 +454,8 @@ def _fault_of_parameter(value: Any) -> str:
         return "a list in ROS parameters has only booleans, numbers or text"
     if any(isinstance(item, float) and not math.isfinite(item) for item in items):
         return "a finite number is required"
+    if any(isinstance(item, int) and not -(2**63) <= item < 2**63 for item in items):
+        return "a whole number of 64 bits is required, -2**63 to 2**63 - 1"
     return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 

@@ -320,6 +320,7 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, module: x, ros: true, parameters: {b: }", "parameters.b: a value is required"),
         ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
         ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is required"),
+        ("name: a, module: x, ros: true, parameters: {b: [9223372036854775808]}", "of 64 bits is"),
         ("name: a, command: x, working_directory: ''", "f.yaml:1:54: working_directory: "),
         ("name: a, command: x, environment: {A=B: c}", "'A=B' cannot be a variable"),
         ("name: a, command: x, restart: sometimes", 'restart.when: "sometimes" is unknown'),
