@@ -23,6 +23,8 @@ _DECIDED: Final = {
 _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
 #: Decimals of a score; further ones are rounding errors of a sum, such as 1.4e-17.
 _DECIMALS: Final = 9
+#: Most flows of a process that are shown.
+_MOST_FLOWS: Final = 8
 _UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 
 
@@ -34,7 +36,7 @@ def render(explanation: Mapping[str, Any]) -> RenderableType:
 def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
     yield _headline(explanation)
     if explanation.get("flows"):
-        yield _flows(explanation["flows"])
+        yield _flows(explanation["flows"], explanation.get("flows_omitted", 0))
     if explanation.get("kept"):
         yield _replicas(explanation["kept"])
     if explanation.get("checkpoint"):
@@ -75,10 +77,15 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
     return text
 
 
-def _flows(flows: list[Mapping[str, Any]]) -> Text:
-    """Return the flows from and to other processes, and why some of them do not count yet."""
+def _flows(flows: list[Mapping[str, Any]], omitted: int) -> Text:
+    """Return the flows from and to other processes, and why some of them do not count yet.
+
+    Args:
+        flows: the largest first.
+        omitted: number of smaller flows.
+    """
     lines = []
-    for one in flows:
+    for one in flows[:_MOST_FLOWS]:
         where = f" on {one['host']}" if one["host"] else ""
         text = (
             f"{amount(one['rate'], 'B/s')} {'from' if one['incoming'] else 'to'} "
@@ -91,7 +98,10 @@ def _flows(flows: list[Mapping[str, Any]]) -> Text:
         if not one["host"]:
             text += f" does not count yet: {one['process']} {one['reason']}"
         lines.append(text)
-    return Text(f"Flows: {'; '.join(lines)}.")
+    others = len(flows) - len(lines) + omitted
+    if others:
+        lines.append(f"and {counted(others, 'smaller flow')}")
+    return Text(f"Flows: {lines[0]}." if len(lines) == 1 else "\n  ".join(["Flows:", *lines]))
 
 
 def _replicas(replicas: list[Mapping[str, Any]]) -> Text:

@@ -178,7 +178,7 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         "decision": None if decision is None else {**decision, "elapsed": age},
         "limits": _limits(state, process),
         "defaults": defaulted_values(process.spec, process.defaulted),
-        "flows": described_flows(state, process),
+        **described_flows(state, process),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
         "history": [

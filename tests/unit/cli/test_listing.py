@@ -274,6 +274,23 @@ def test_explain_shows_limits_and_whether_they_hold():
     assert "limits.memory 500 MB (earlier runs of its program used 600 MB), nice -5." in above
 
 
+def flow(process: str, rate: float) -> dict[str, object]:
+    """Return a measured flow from a process on beta, as a master explains it."""
+    return {"process": process, "rate": rate, "incoming": True, "host": "beta", "learned": True}
+
+
+def test_explain_shows_the_largest_flows_one_a_line():
+    """A single flow is a sentence, and smaller flows are counted."""
+    lines = drawn(explain.render({**STORY, "flows": [flow("camera", 2e6)]}))
+    assert "Flows: 2.0 MB/s from camera on beta (measured)." in lines
+    many = [flow(f"p{number}", 1e3 * (20 - number)) for number in range(12)]
+    lines = drawn(explain.render({**STORY, "flows": many, "flows_omitted": 3}))
+    at = lines.index("Flows:")
+    assert lines[at + 1] == "  20.0 kB/s from p0 on beta (measured)"
+    assert lines[at + 8] == "  13.0 kB/s from p7 on beta (measured)"
+    assert lines[at + 9] == "  and 7 smaller flows"
+
+
 def test_ps_shows_the_limits_that_hold():
     """Without any, there is no column for them."""
     other = process("other")

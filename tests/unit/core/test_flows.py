@@ -177,6 +177,15 @@ def test_a_flow_to_a_process_that_does_not_exist_does_not_count_until_both_run()
     assert (flow["host"], flow["reason"]) == ("base", "")
 
 
+def test_an_explanation_has_the_largest_flows_and_counts_the_others() -> None:
+    """A process may exchange data with all others, and an answer has a bound."""
+    cluster = Cluster(machine("a"))
+    cluster.submit(process("hub", talks_to={f"p{number}": float(number) for number in range(100)}))
+    explained = cluster.explain("hub")
+    assert [one["rate"] for one in explained["flows"]] == [float(99 - n) for n in range(64)]
+    assert explained["flows_omitted"] == 36
+
+
 def test_an_ended_process_takes_no_room_of_a_link() -> None:
     """The flows that an ended process declares do not count, either."""
     cluster = cluster_of({"a": 5, "b": 100}, on("a", "camera"))

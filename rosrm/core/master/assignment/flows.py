@@ -22,6 +22,8 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.links import Crossing
 from rosrm.core.master.state.process import Process
 
+#: Most flows in an explanation.
+_MOST_DESCRIBED: Final = 64
 _NONE: Final = frozenset[str]()
 
 
@@ -96,12 +98,17 @@ def _link(
     return trip, rate
 
 
-def described_flows(state: MasterState, process: Process) -> list[Mapping[str, Any]]:
-    """Return the flows of a process for `explain`, also those that do not count yet."""
+def described_flows(state: MasterState, process: Process) -> Mapping[str, Any]:
+    """Return the largest flows of a process for `explain`, also those that do not count yet."""
+    flows = {
+        other: state.flows.between(process.name, other)
+        for other in state.flows.partners.get(process.name, ())
+    }
+    largest = sorted(flows, key=lambda other: -flows[other].rate)[:_MOST_DESCRIBED]
     rows: list[Mapping[str, Any]] = []
     here = _host(state, process.name)
-    for other in state.flows.partners.get(process.name, ()):
-        flow, host = state.flows.between(process.name, other), _host(state, other)
+    for other in largest:
+        flow, host = flows[other], _host(state, other)
         trip, rate = _link(state, here, host)
         rows.append(
             {
@@ -111,4 +118,4 @@ def described_flows(state: MasterState, process: Process) -> list[Mapping[str, A
                 "reason": host_of(state, other)[1] if host is None else "",
             }
         )  # fmt: skip
-    return rows
+    return {"flows": rows, "flows_omitted": len(flows) - len(rows)}
