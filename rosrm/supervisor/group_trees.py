@@ -110,9 +110,11 @@ def _tree(mount: cgroups.Mount, known: set[str], name: str, root: str) -> Tree |
     top = os.path.join(base, name)
     tree = Tree(mount.version, top, home, controllers)
     if not os.path.isdir(top):
-        make_repeatedly(lambda: make_top(tree))
-        with contextlib.suppress(FileNotFoundError):
-            os.rmdir(top)
+        try:
+            make_repeatedly(lambda: make_top(tree))
+        finally:
+            with contextlib.suppress(OSError):
+                os.rmdir(top)
     return tree
 
 

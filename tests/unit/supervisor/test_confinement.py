@@ -346,6 +346,18 @@ def test_a_state_directory_that_is_gone_is_a_reason(tmp_path: Path) -> None:
     assert "No such file or directory" in found.missing["limits.memory"]
 
 
+def test_a_group_in_which_no_others_can_be_made_is_removed(tmp_path: Path, monkeypatch) -> None:
+    """The group of the supervisor is made for the question only, and nothing would remove it."""
+    root, own = recorded_tree("systemd", tmp_path, "memory cpu")
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENODEV, "No such device")
+
+    monkeypatch.setattr(cgroups, "enable", refuse)
+    assert "No such device" in group_trees.find(str(tmp_path), root).missing["limits.memory"]
+    assert not list(Path(own).glob("rosrm-state-*"))
+
+
 def test_a_controller_that_is_not_delegated_is_named(tmp_path: Path, plain) -> None:
     """The other one can be used."""
     root, own = recorded_tree("systemd", tmp_path, "memory")
