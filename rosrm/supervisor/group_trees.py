@@ -189,7 +189,7 @@ def _missing_rights() -> dict[str, str]:
     missing = {}
     if not resource.getrlimit(resource.RLIMIT_RTPRIO)[0]:
         missing["realtime"] = "CAP_SYS_NICE or a limit `rtprio` (RLIMIT_RTPRIO) is required"
-    # 20 - nice: 20 allows niceness 0. An unlimited one is -1.
+    # The limit is 20 less the niceness, so that 20 allows niceness 0. An unlimited one is -1.
     if resource.getrlimit(resource.RLIMIT_NICE)[0] in range(21):
         missing["nice"] = "CAP_SYS_NICE or a limit `nice` (RLIMIT_NICE) is required"
     return missing

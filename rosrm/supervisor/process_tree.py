@@ -177,7 +177,7 @@ class ProcessTrees:
         return [stat for stat in stats if stat is not None and stat.alive]
 
     def out_of_memory(self, key: Key) -> tuple[float, float] | None:
-        """Return the same as `InstanceGroups.out_of_memory`."""
+        """Return used bytes and limit (0: none) if the OOM killer ended a process of this run."""
         return self._groups.out_of_memory(key)
 
     def _look_at_adopted(self) -> None:

@@ -5,8 +5,8 @@ observed                        action
 ==============================  =============================================================
 `link_period` after the last    `MeasureLinks` with the next peers of the host; one host in
 measurement of a host           each tick, and at most PROBES peers a second in all
-the slave has answered          the report replaces what was known of the host; entries that
-                                cannot be are left out, and recorded; a flow that is not
+the slave has answered          the report replaces what was known of the host; impossible
+                                entries are left out and recorded; a flow that is not
                                 reported for `LEARNED_FOR` stops counting
 no answer in time               the order is repeated after `link_period`
 the slave refuses the order     the host is asked again when it registers
