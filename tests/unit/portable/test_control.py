@@ -56,12 +56,10 @@ def start():
     started = []
 
     def start(program: str) -> subprocess.Popen:
+        # Short sleeps: a signal just before the call of one is handled at its end only.
+        waits = "import time\nwhile True: time.sleep(0.1)"
         process = subprocess.Popen(
-            [
-                sys.executable,
-                "-c",
-                f"{program}\nprint('on', flush=True)\nimport time\ntime.sleep(60)",
-            ],
+            [sys.executable, "-c", f"{program}\nprint('on', flush=True)\n{waits}"],
             stdout=subprocess.PIPE,
         )
         started.append(process)
