@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from rosrm.extensions.contracts import PlacementFilter, ScoringPolicy
+from rosrm.extensions.declared_fields import FLOWS_FIELD
 from rosrm.extensions.plugin_calls import PluginCalls
 from rosrm.wording import weighted
 
@@ -58,6 +59,7 @@ class PlacementPlugins:
         filters: in the order in which they are asked.
         calls: guards every call of them.
         reads: all fields of the spec that one of them reads beyond the standard ones.
+        without_flows: those that do not read the flows of a process, without a fallback.
     """
 
     chain: tuple[ScoringLink, ...] = ()
@@ -65,13 +67,20 @@ class PlacementPlugins:
     filters: tuple[SelectedFilter, ...] = ()
     calls: PluginCalls = field(default_factory=PluginCalls, compare=False)
     reads: tuple[str, ...] = field(init=False, compare=False)
+    without_flows: PlacementPlugins = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Set `reads` to the fields that the offers declare, each once."""
+        """Set `reads` to the fields that the offers declare, each once, and `without_flows`."""
         fallback = () if self.fallback is None else (self.fallback,)
         readers: tuple[ScoringLink | SelectedFilter, ...] = (*self.chain, *fallback, *self.filters)
         read = (name for one in readers for name in one.reads)
         object.__setattr__(self, "reads", tuple(dict.fromkeys(read)))
+        rest = self
+        if FLOWS_FIELD in self.reads:
+            chain = tuple(one for one in self.chain if FLOWS_FIELD not in one.reads)
+            filters = tuple(one for one in self.filters if FLOWS_FIELD not in one.reads)
+            rest = replace(self, chain=chain, filters=filters, fallback=None)
+        object.__setattr__(self, "without_flows", rest)
 
 
 #: Creates the policies of a chain.

@@ -16,7 +16,7 @@ from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
-from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.flows import Flows
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
@@ -135,7 +135,7 @@ class MasterState:
         self.reloads = Reloads()
         self.chain_of: ChainOf | None = None
         self.unowned_instances: dict[str, set[int]] = {}
-        self.rankings: dict[Any, Ranking] = {}
+        self.rankings: dict[RankingKey, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
         self.plugins = placement.calls
@@ -155,7 +155,7 @@ class MasterState:
         self.stranger_refused_at = -inf
         self.ahead_since: dict[int, tuple[float, int]] = {}
         self.reviewed = -inf
-        self.demands: dict[Any, Demand] = {}
+        self.demands: dict[RankingKey, Demand] = {}
         self._out: list[Command] = []
         self._unsaved: dict[str, Process] = {}
         self._unsaved_migrations: dict[str, Migration] = {}

@@ -7,9 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rosrm import BoolArray, HostView, ProcessView, Scores
+from rosrm.core.master.assignment.assign import demand_of, ranking_of
+from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.scheduling.traffic import flow_view, keeping_limits
 from rosrm.core.master.state.demand import Flow, Traffic
 from rosrm.core.master.state.links import Crossing, LinkTable
+from rosrm.extensions.placement import ScoringLink, SelectedFilter
 from rosrm.model.links import Interface
 from rosrm.model.values import ProcessSpec
 from rosrm_scoring.network import Network, NetworkOptions
@@ -243,6 +247,79 @@ def test_equal_processes_with_flows_are_each_placed_by_the_load_of_the_moment() 
     cluster.submit(*specs)
     hosts = [cluster.where(spec.name)[0] for spec in specs]
     assert sorted(hosts) == ["b", "b", "c", "c"]
+
+
+class Asked:
+    """Scores by the reading of memory; remembers for how many hosts it was asked at once."""
+
+    def __init__(self) -> None:
+        self.sizes: list[int] = []
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        self.sizes.append(len(hosts.usage))
+        return Scores(hosts.column("memory") * 10)
+
+
+class Loud:
+    """A filter that excludes the hosts where a flow would be local."""
+
+    def mask(self, hosts: HostView, process: ProcessView) -> BoolArray:
+        return np.broadcast_to(~process.flows.is_local.any(axis=1), len(hosts.usage)).copy()
+
+    def reason(self, hosts: HostView, process: ProcessView, row: int) -> str:
+        return "a flow would be local"
+
+
+NETWORK = ScoringLink("network", Network(NetworkOptions()), 0.5, ("talks_to",))
+
+
+def test_only_what_reads_flows_is_asked_again_about_a_process_with_flows() -> None:
+    """Of a chain, the other policies score all hosts once for processes with equal needs."""
+    asked = Asked()
+    rate = {"a": 100.0, **{f"h{number}": 10.0 for number in range(20)}}
+    cluster = Cluster(*map(machine, rate), chain=(ScoringLink("asked", asked), NETWORK))
+    wire(cluster, rate)
+    cluster.submit(on("a", "camera"))
+    asked.sizes.clear()
+    cluster.submit(*(process(f"v{n}", talks_to={"camera": 1 * MB + n}) for n in range(5)))
+    assert asked.sizes.count(len(rate)) == 1
+
+
+def test_a_shared_ranking_with_flows_beside_it_decides_as_one_of_the_process_alone() -> None:
+    """Scores, vetoes and filters that read flows are the same in both, after any assignments."""
+    chance = np.random.default_rng(5)
+    rate = {name: float(chance.integers(5, 100)) for name in "abcdef"}
+    filters = (SelectedFilter("loud", Loud(), reads=("talks_to",)),)
+    chain = (NETWORK, ScoringLink("asked", Asked()))
+    cluster = Cluster(*map(machine, rate), chain=chain, filters=filters)
+    wire(cluster, rate)
+    compared = 0
+    for turn in range(40):
+        others = chance.choice(turn + 1, min(turn, 3), replace=False)
+        flows = {f"p{one}": float(chance.integers(1, 9)) * MB for one in others}
+        cluster.submit(process(f"p{turn}", memory=float(turn % 3 + 1), talks_to=flows))
+        demand = demand_of(cluster.state, cluster[f"p{turn}"])
+        shared = ranking_of(cluster.state, demand)
+        assert np.allclose(shared.value, Ranking(cluster.state.hosts, demand).value)
+        compared += bool(demand.traffic.flows and np.isfinite(shared.value).any())
+    assert compared > 10
+
+
+def test_the_fallback_decides_if_a_policy_that_reads_flows_fails() -> None:
+    """The shared ranking has no policy then, and the decision names the failure."""
+
+    class Broken:
+        def score(self, hosts: HostView, process: ProcessView) -> Scores:
+            raise RuntimeError("out of order")
+
+    chain = (ScoringLink("broken", Broken(), reads=("talks_to",)),)
+    fallback = ("asked", Asked())
+    cluster = Cluster(machine("a", 0.3), machine("b", 0.2), chain=chain, fallback=fallback)
+    cluster.submit(process("camera"))
+    cluster.submit(process("viewer", talks_to={"camera": 1 * MB}))
+    assert cluster.where("viewer") == ["b"]
+    policy = cluster.explain("viewer")["decision"]["policy"]
+    assert policy.startswith("asked (left out: 'broken'"), policy
 
 
 def test_a_restarted_master_knows_the_declared_flows() -> None:

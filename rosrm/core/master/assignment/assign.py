@@ -169,9 +169,9 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
     ranking = state.rankings.get(demand.key)
     if ranking is not None:
         ranking.refresh()
-    elif demand.key[1]:
-        alone = state.rankings.get((demand.key[0], ()))
-        alone = ranking_of(state, alone.demand if alone else demand.alone())
+    elif demand.key is not demand.key_alone:
+        known = state.rankings.get(demand.key_alone)
+        alone = ranking_of(state, known.demand if known else demand.alone())
         ranking = state.rankings[demand.key] = alone.beside(demand)
     else:
         ranking = Ranking(state.hosts, demand)

@@ -17,7 +17,6 @@ has ended               the standby is stopped
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 from rosrm.core.master import lifecycle
@@ -108,7 +107,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
     spread = [rule.by for rule in process.spec.neighbours if rule.group and not rule.prefer]
     apart_by = dict.fromkeys((*process.spec.standby.apart_by, *filter(None, spread)))
     neighbours = tuple(
-        replace(rule, prefer=rule.prefer or rule.relation == "near") for rule in own.neighbours
+        rule._replace(prefer=rule.prefer or rule.relation == "near") for rule in own.neighbours
     )
     for host in state.hosts.hosts:
         for label in apart_by:

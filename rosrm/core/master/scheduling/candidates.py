@@ -36,7 +36,7 @@ class Candidates:
         sets: (n,) number of further processes of this demand for which the host has devices; at
             most COUNTED.
         more: (n,) number of processes of this demand that were added to each host; None: none.
-        flows: flows of the process on each host; None: it has none, or no policy reads them.
+        known_flows: flows of the process on each host; None: not computed yet.
         empty: True if the arrays are those of hosts without processes.
         tenants: (n,) name to spec of each process on the host; None: as the table has them now.
         tenants_read: True if a plugin has read which processes run on one of the hosts.
@@ -54,7 +54,7 @@ class Candidates:
     inventories: list[Inventory]
     sets: IntArray | None = None
     more: IntArray | None = None
-    flows: FlowView | None = None
+    known_flows: FlowView | None = None
     empty: bool = False
     tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
     tenants_read: bool = False
@@ -73,6 +73,15 @@ class Candidates:
     def keep_tenants(self) -> None:
         """Copy the current processes of each host, because they change before they are read."""
         self.tenants = tuple(map(self.tenants_of, range(len(self))))
+
+    def flows(self) -> FlowView:
+        """Return the flows of the process on each host."""
+        if self.known_flows is None:
+            at, table = self.columns, self.table
+            columns = np.arange(len(table))[at] if isinstance(at, slice) else at
+            traffic = self.demand.traffic
+            self.known_flows = flow_view(table.links, traffic, columns, empty=self.empty)
+        return self.known_flows
 
     def host(self, row: int) -> Host:
         """Return the host of a row."""
@@ -100,19 +109,11 @@ def candidates(
         table=table, demand=demand, columns=columns, resources=table.resources, need=need,
         cells=cells, busy=busy, processes=processes, bound=table.bound[columns],
         inventories=table.devices.at(columns), more=more,
-        flows=_flows(table, demand, columns),
     )  # fmt: skip
     if demand.spec.devices:
         sets = table.devices.counts(demand.spec.devices)[columns]
         hosts.sets = sets if more is None else sets - more
     return hosts
-
-
-def _flows(table: HostTable, demand: Demand, columns: Columns) -> FlowView | None:
-    if not demand.traffic.flows or not demand.scores_flows:
-        return None
-    at = np.arange(len(table))[columns] if isinstance(columns, slice) else columns
-    return flow_view(table.links, demand.traffic, at)
 
 
 def as_if_empty(table: HostTable, demand: Demand, columns: Columns) -> Candidates:

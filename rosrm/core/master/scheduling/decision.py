@@ -192,6 +192,7 @@ def verdict_of(ranking: Ranking, column: int) -> Verdict:
 def _moment(ranking: Ranking, columns: list[int]) -> Moment:
     at = np.array(columns, np.int64)
     hosts = candidates(ranking.table, ranking.demand, ranking.need, at)
+    hosts.known_flows = ranking.flows(at)
     value = ranking.value[at]
     some_fail = np.inf in value.tolist()
     standing = ranking.standing_refusals(columns) if some_fail else (None,) * len(columns)

@@ -331,6 +331,10 @@ def _why_no_room(hosts: Candidates, row: int) -> str:
 EXCLUSION: Final = Filter("exclusion", _is_not_excluded, _why_excluded, Lasts.PERMANENT)
 NEIGHBOURS: Final = Filter("neighbours", _keeps_neighbours, _why_not_kept, Lasts.NEIGHBOURS)
 LINKS: Final = Filter("links", _keeps_link_limits, _why_over_link, Lasts.NEIGHBOURS)
+PLUGINS: Final = Filter(
+    "plugins", plugin_filters.passing_plugins, plugin_filters.why_plugin_excludes, Lasts.PERMANENT,
+    by_assignment=True,
+)  # fmt: skip
 #: In order: if a host fails several, the first one gives the reason.
 FILTERS: Final = (
     EXCLUSION,
@@ -358,11 +362,8 @@ FILTERS: Final = (
     ),
     Filter("claim", _is_unclaimed, _why_claimed),
     Filter("room", _has_room, _why_no_room, Lasts.PERMANENT, by_assignment=True, verdict="full"),
-    Filter(
-        "plugins", plugin_filters.passing_plugins, plugin_filters.why_plugin_excludes,
-        Lasts.PERMANENT, by_assignment=True,
-    ),
-)  # fmt: skip
+    PLUGINS,
+)
 #: Filters that a host may fail for lack of room alone.
 OF_ROOM: Final = ("processes", "limits", "room")
 STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)

@@ -48,7 +48,8 @@ def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
     `reads`: fields of the spec that the offer of the plugin declares.
     """
     spec = declared_spec(hosts.demand.spec, reads)
-    flows = hosts.flows if FLOWS_FIELD in reads and hosts.flows else NO_FLOWS
+    has_flows = FLOWS_FIELD in reads and hosts.demand.traffic.flows
+    flows = hosts.flows() if has_flows else NO_FLOWS
     return ProcessView(spec, _read_only(hosts.need.T), flows)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from rosrm.core.master.scheduling.candidates import Candidates, Columns, candidates
 from rosrm.core.master.scheduling.filters import (
     BY_ASSIGNMENT,
+    PLUGINS,
     STANDING,
     Refusal,
     passing,
@@ -28,12 +29,14 @@ from rosrm.core.master.scheduling.filters import (
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
-from rosrm.core.master.scheduling.traffic import keeping_limits
+from rosrm.core.master.scheduling.traffic import keeping_limits, rows_of
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.devices import COUNTED
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
 from rosrm.errors import PluginError
+from rosrm.extensions.declared_fields import FLOWS_FIELD
+from rosrm.extensions.link_views import FlowView
 from rosrm.extensions.placement import ScoringLink
 
 #: Added to the score for each process of a host: of equal scores, the host with fewer processes is
@@ -75,6 +78,7 @@ class Ranking:
         self._refusals: dict[int, Refusal | None] = {}
         self._tier = _tiers(table, demand)
         self._preference: FloatArray | None = None
+        self._flows: FlowView | None = None
         self._alone: Ranking | None = None
         self._lowest: list[int] | None = None
         self._own = -1
@@ -93,8 +97,8 @@ class Ranking:
     def beside(self, demand: Demand) -> Ranking:
         """Return this ranking for a demand that differs by its neighbours and flows alone.
 
-        These change with each assignment, so that few demands share a ranking with them. The scores
-        of the policy do not depend on them.
+        These change with each assignment, so that few demands share a ranking with them. Only the
+        policies and filters that read flows, which this ranking left out, are asked again.
         """
         found = copy(self)
         found._set_surroundings(demand, self)  # noqa: SLF001 - it is of this class
@@ -110,6 +114,23 @@ class Ranking:
             if kept is not None:
                 self._standing = self._standing & kept
                 self.value[~kept] = np.inf
+        if demand.flows_are_read:
+            self._judge_flows(alone)
+
+    def _judge_flows(self, alone: Ranking) -> None:
+        """Add the scores of the policies that read flows, and apply such filters."""
+        chain, every = self.demand.plugins.chain, slice(0, len(self.table))
+        readers = tuple(one for one in chain if FLOWS_FIELD in one.reads)
+        self.judges = tuple(one for one in chain if one in alone.judges or one in readers)
+        self._fallback = self.demand.plugins.fallback
+        judged = candidates(self.table, self.demand, self.need, every)
+        self._flows = judged.flows()
+        fits = passing([PLUGINS], judged, self.value < np.inf)
+        value = self._scored(readers, judged, fits, np.where(fits, self.value, 0.0))
+        if value is None:
+            self._judge(every)
+        else:
+            self.value = value
 
     def note_assignment(self) -> None:
         """Note that the newest change of the table was an assignment of this demand."""
@@ -206,13 +227,20 @@ class Ranking:
         `more`, (n,), adds this number of further processes of this demand to each host.
         """
         judged = candidates(self.table, self.demand, self.need, columns, more)
+        judged.known_flows = self.flows(columns)
         fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
-        value = TIE * judged.processes
+        value: FloatArray = np.multiply(judged.processes, TIE, dtype=np.float64)
         if self._preference is not None:
             value = value + self._preference[columns]
-        for link in self.judges if np.count_nonzero(fits) else ():
+        return self._scored(self.judges, judged, fits, value)
+
+    def _scored(
+        self, judges: Sequence[ScoringLink], judged: Candidates, fits: BoolArray, value: FloatArray
+    ) -> FloatArray | None:
+        """Add the scores of policies to values; None: a policy was left out, so all are void."""
+        for link in judges if np.count_nonzero(fits) else ():
             try:
-                score, veto = _scored(link, judged, fits)
+                score, veto = _answer(link, judged, fits)
             except PluginError as error:
                 self._leave_out(link, error)
                 return None
@@ -221,6 +249,10 @@ class Ranking:
                 fits = fits & ~veto
         self.reads_tenants = self.reads_tenants or judged.tenants_read
         return np.where(fits, value, np.inf)
+
+    def flows(self, columns: Columns) -> FlowView | None:
+        """Return the flows of the process on some hosts; None: no plugin has read them."""
+        return self._flows and rows_of(self._flows, columns)
 
     def _leave_out(self, link: ScoringLink, error: PluginError) -> None:
         """Leave out a policy that raised or broke its contract.
@@ -245,7 +277,7 @@ class Ranking:
         return np.where(self._tier == best, self.value, np.inf)
 
 
-def _scored(
+def _answer(
     link: ScoringLink, hosts: Candidates, fits: BoolArray
 ) -> tuple[FloatArray, BoolArray | None]:
     """Return the weighted scores and the vetoes of a policy; raise PluginError if it fails."""

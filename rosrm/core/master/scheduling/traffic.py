@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
+import numpy.typing as npt
 
 from rosrm.core.master.state.demand import Flow, Traffic
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.links import LinkTable
 from rosrm.extensions.link_views import FlowView
 
-#: Tolerance in comparisons of sums of rates.
-_CLOSE: Final = 1.0 - 1e-9
 #: A learned flow counts as at most this share of what flows may use of a link. Otherwise two nodes
 #: that exchange more in the memory of one host could never leave it.
 _MOST_LEARNED: Final = 0.5
@@ -21,9 +22,7 @@ _MOST_LEARNED: Final = 0.5
 def keeping_limits(
     links: LinkTable, traffic: Traffic, hosts: int, *, empty: bool = False
 ) -> BoolArray | None:
-    """Return the mask, (H,), of hosts whose links stay within their limits; None: none is known.
-
-    `FlowView` has the same values with their parts; this function is faster for all hosts.
+    """Return the mask, (H,), of hosts whose links stay within their limits; None: all of them do.
 
     Args:
         hosts: number of hosts.
@@ -31,41 +30,17 @@ def keeping_limits(
     """
     if not traffic.flows or not links.size:
         return None
-    room = links.usable if empty else links.room
-    if traffic.counted and not empty:
-        room = links.usable - links.load_without(traffic.counted)
-    known = min(hosts, links.size)
-    by_host: dict[int, list[Flow]] = {}
-    for flow in traffic.flows:
-        by_host.setdefault(flow.column, []).append(flow)
-    first, usable = links.cells[:known], links.usable.ravel()
-    near = {column: links.facing[links.row(column), :known] for column in by_host}
+    doubtful = np.arange(min(hosts, links.size))
+    if not empty:
+        total = sum(flow.rate for flow in traffic.flows)
+        others = [links.row(flow.column) for flow in traffic.flows]
+        if links.least_room[others].min() >= total:  # so only the host itself may lack room
+            doubtful = np.flatnonzero(links.least_room[: len(doubtful)] < total)
+    if not len(doubtful):
+        return None
     kept = np.ones(hosts, np.bool_)
-    for column, flows in by_host.items():
-        cell = first + near[column]
-        added = sum(_counts_as(flow, usable, cell) for flow in flows)
-        for other, more in by_host.items():
-            if other != column:  # both may cross the same interface
-                also = sum(_counts_as(flow, usable, cell) for flow in more)
-                also = also * (near[other] == near[column])
-                if other < known:
-                    also[other] = 0.0
-                added = added + also
-        far = links.cells[links.row(column)] + links.interface[links.row(column), :known]
-        received = sum(_counts_as(flow, usable, far) for flow in flows)
-        crosses = room.ravel().take(cell) >= added * _CLOSE
-        crosses &= room.ravel().take(far) >= received * _CLOSE
-        if column < known:
-            crosses[column] = True
-        kept[:known] &= crosses
+    kept[doubtful] = ~flow_view(links, traffic, doubtful, empty=empty).is_over().any(axis=1)
     return kept
-
-
-def _counts_as(flow: Flow, usable: FloatArray, cells: IntArray) -> float | FloatArray:
-    """Return the bytes a second as which a flow counts on interfaces, given by their cells."""
-    if not flow.learned:
-        return flow.rate
-    return np.minimum(flow.rate, _MOST_LEARNED * usable.take(cells))
 
 
 def flow_view(
@@ -76,48 +51,83 @@ def flow_view(
     Args:
         empty: True: as if nothing but the process used the links.
     """
-    flows, every = traffic.flows, np.arange(len(columns))
+    flows, here = traffic.flows, np.minimum(columns, links.size)
     load = np.zeros_like(links.load) if empty else links.load_without(traffic.counted)
-    here = np.minimum(columns, links.size)
-    is_local = columns[:, None] == np.array([flow.column for flow in flows], np.int64)
-    there = [links.row(flow.column) for flow in flows]
-    near = links.interface[here[:, None], there]
-    far = links.interface[there, here[:, None]]
-    added, usable = np.zeros((len(columns), load.shape[1])), links.usable.ravel()
-    to_host: dict[int, float | FloatArray] = {}
-    for at, flow in enumerate(flows):
-        sent = _counts_as(flow, usable, links.cells[here] + near[:, at])
-        added[every, near[:, at]] += np.where(is_local[:, at], 0.0, sent)
-        received = _counts_as(flow, usable, links.cells[there[at]] + far[:, at])
-        to_host[flow.column] = to_host.get(flow.column, 0.0) + received
-    arriving = [np.broadcast_to(to_host[flow.column], len(columns)) for flow in flows]
-    ends = (
-        (here[:, None], near, added[every[:, None], near]),
-        (np.array(there, np.int64), far, np.stack(arriving, axis=1)),
-    )
-    rooms = [links.usable[row, at] - load[row, at] - more for row, at, more in ends]
-    is_near = rooms[0] <= rooms[1]
-
-    def chosen(near: FloatArray, far: FloatArray, local: float) -> FloatArray:
-        """Return the values, (N, F), of the end with less room."""
-        values = np.where(is_local, local, np.where(is_near, near, far))
-        values.flags.writeable = False
-        return values
-
-    (first, near, _), (second, far, _) = ends
-    rate, limit, used = (
-        chosen(values[first, near], values[second, far], local)
-        for values, local in (
-            (links.rate, np.inf), (links.rate * links.limit[:, None], np.inf), (load, 0.0),
-        )
-    )  # fmt: skip
+    room = links.room if load is links.load else links.usable - load
+    others = [links.row(flow.column) for flow in flows]
+    is_local = np.array([[flow.column] for flow in flows], np.int64) == columns
+    first = links.cells.take(here)
+    near = [first + links.facing[other].take(here) for other in others]
+    far = [links.cells[other] + links.interface[other].take(here) for other in others]
+    sent = _sent(links, flows, near, ~is_local)
+    received = _received(links, flows, far)
+    # Arrays of (F, N), because one flow after the other is faster than all at once.
+    rate, limit, used, added, round_trip = np.empty((5, *is_local.shape))
+    for row, other in enumerate(others):
+        is_near = room.take(near[row]) - sent[row] <= room.take(far[row]) - received[row]
+        cells = np.where(is_near, near[row], far[row])
+        rate[row], limit[row] = links.rate.take(cells), links.allowed.take(cells)
+        used[row], added[row] = load.take(cells), np.where(is_near, sent[row], received[row])
+        round_trip[row] = links.round_trip[other].take(here)
+    rate[is_local] = limit[is_local] = np.inf
+    used[is_local] = added[is_local] = round_trip[is_local] = 0.0
+    by_host = (_by_host(one) for one in (is_local, rate, limit, used, added, round_trip))
     return FlowView(
         tuple(flow.process for flow in flows), tuple(flow.host for flow in flows),
         np.array([flow.rate for flow in flows]),
-        np.array([flow.incoming for flow in flows], np.bool_), is_local, rate, limit, used,
-        chosen(ends[0][2], ends[1][2], 0.0),
-        np.where(is_local, 0.0, links.round_trip[here[:, None], there]),
+        np.array([flow.incoming for flow in flows], np.bool_), *by_host,
     )  # fmt: skip
+
+
+def rows_of(view: FlowView, rows: slice | IntArray) -> FlowView:
+    """Return the flows on some of the hosts of a view."""
+    return replace(
+        view, is_local=view.is_local[rows], link_rate=view.link_rate[rows],
+        link_limit=view.link_limit[rows], link_load=view.link_load[rows], added=view.added[rows],
+        round_trip=view.round_trip[rows],
+    )  # fmt: skip
+
+
+def _sent(
+    links: LinkTable, flows: Sequence[Flow], near: Sequence[IntArray], counts: BoolArray
+) -> list[FloatArray]:
+    """Return the sum of the flows that would cross the interface of each flow, (N,), at the host.
+
+    Args:
+        near: (N,) cells of the interfaces, for each flow.
+        counts: (F, N) False: the flow is local.
+    """
+    interfaces = links.load.shape[1]
+    rows = np.arange(counts.shape[1]) * interfaces
+    cells = [rows + one % interfaces for one in near]
+    total = np.zeros(counts.shape[1] * interfaces)
+    for row, flow in enumerate(flows):
+        total[cells[row]] += counts[row] * _counts_as(links, flow, near[row])
+    return [total.take(one) for one in cells]
+
+
+def _received(
+    links: LinkTable, flows: Sequence[Flow], far: Sequence[IntArray]
+) -> list[float | FloatArray]:
+    """Return the sum of the flows that arrive at the host of each flow's other process, (N,)."""
+    total: dict[int, float | FloatArray] = {}
+    for flow, cells in zip(flows, far, strict=True):
+        total[flow.column] = total.get(flow.column, 0.0) + _counts_as(links, flow, cells)
+    return [total[flow.column] for flow in flows]
+
+
+def _counts_as(links: LinkTable, flow: Flow, cells: IntArray) -> float | FloatArray:
+    """Return the bytes a second as which a flow counts on interfaces, given by their cells."""
+    if not flow.learned:
+        return flow.rate
+    return np.minimum(flow.rate, _MOST_LEARNED * links.usable.take(cells))
+
+
+def _by_host(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return values of (F, N) as a read-only view of (N, F)."""
+    found: npt.NDArray[Any] = values.T
+    found.flags.writeable = False
+    return found
 
 
 def round_trips(links: LinkTable, columns: IntArray, peers: IntArray) -> FloatArray:

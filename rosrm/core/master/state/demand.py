@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 from rosrm.core.master.state.links import Crossing
-from rosrm.extensions.declared_fields import FLOWS_FIELD, STANDARD_FIELDS
+from rosrm.extensions.declared_fields import STANDARD_FIELDS
 from rosrm.extensions.placement import NO_PLUGINS, PlacementPlugins
 from rosrm.model.values import EMPTY, ProcessSpec, Relation
 
@@ -19,8 +19,7 @@ _mappings_of: Final = attrgetter(*_MAPPINGS)
 _plain_fields_of: Final = attrgetter(*(name for name in STANDARD_FIELDS if name not in _MAPPINGS))
 
 
-@dataclass(frozen=True, slots=True)
-class Neighbour:
+class Neighbour(NamedTuple):
     """A rule of or about a process, with the current hosts of the other processes.
 
     Attributes:
@@ -71,8 +70,21 @@ class Traffic(NamedTuple):
 
 NO_TRAFFIC: Final = Traffic()
 
-#: Values that decide about a ranking: those of the process alone, and its neighbours and flows.
-RankingKey = tuple[tuple[Any, ...], tuple[Neighbour | Traffic, ...]]
+
+class RankingKey:
+    """Values that are compared and hashed; the hash is computed once for several look-ups."""
+
+    __slots__ = ("_hash", "_values")
+
+    def __init__(self, *values: Hashable) -> None:
+        self._values = values
+        self._hash = hash(values)
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RankingKey) and self._values == other._values
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +100,8 @@ class Demand:
         neighbours: rules on its hosts, relative to other processes.
         traffic: flows between it and other processes.
         plugins: the policies and filters that judge hosts.
-        key: equal for demands with equal rankings; its first part, for demands that differ by
-            their neighbours alone, or by their flows, unless the policies read them.
+        key: equal for demands with equal rankings.
+        key_alone: equal for demands that differ by their neighbours and flows alone.
     """
 
     spec: ProcessSpec
@@ -102,32 +114,38 @@ class Demand:
     traffic: Traffic = NO_TRAFFIC
     plugins: PlacementPlugins = field(default=NO_PLUGINS, compare=False)
     key: RankingKey = field(init=False, compare=False)
+    key_alone: RankingKey = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
-        scored, added = self._traffic_keys()
-        alone = (
+        read = self.shared_plugins.reads
+        alone = RankingKey(
             *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
             _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
-            # As text, because 1, 1.0 and True are equal and a policy can tell them apart.
-            *(repr(getattr(self.spec, name)) for name in self.plugins.reads), *scored,
+            *map(self._as_text, read),
         )  # fmt: skip
-        object.__setattr__(self, "key", (alone, (*self.neighbours, *added)))
+        also_read = (name for name in self.plugins.reads if name not in read)
+        traffic = (self.traffic, *map(self._as_text, also_read)) if self.traffic.flows else ()
+        around = (*self.neighbours, *traffic)
+        object.__setattr__(self, "key_alone", alone)
+        object.__setattr__(self, "key", RankingKey(alone, *around) if around else alone)
 
-    def _traffic_keys(self) -> tuple[tuple[Traffic, ...], tuple[Traffic, ...]]:
-        """Return the flows as a part of the first and of the second part of the key."""
-        if not self.traffic.flows:
-            return (), ()
-        return ((self.traffic,), ()) if self.scores_flows else ((), (self.traffic,))
+    def _as_text(self, field_name: str) -> str:
+        """Return a field of the spec as text: 1, 1.0 and True are equal, a policy can tell them."""
+        return repr(getattr(self.spec, field_name))
 
     @property
-    def scores_flows(self) -> bool:
-        """Return True if the scores of the policies may depend on the flows."""
-        return FLOWS_FIELD in self.plugins.reads
+    def shared_plugins(self) -> PlacementPlugins:
+        """Return the plugins that share their answers with all demands of the same `key_alone`."""
+        return self.plugins.without_flows if self.traffic.flows else self.plugins
+
+    @property
+    def flows_are_read(self) -> bool:
+        """Return True if a policy or filter may read the flows."""
+        return self.shared_plugins is not self.plugins
 
     def alone(self) -> Demand:
-        """Return the demand without what the second part of its key contains."""
-        traffic = self.traffic if self.scores_flows else NO_TRAFFIC
-        return replace(self, neighbours=(), traffic=traffic)
+        """Return the demand whose `key` is the `key_alone` of this one."""
+        return replace(self, neighbours=(), traffic=NO_TRAFFIC, plugins=self.shared_plugins)
 
     @property
     def declared(self) -> frozenset[str]:

@@ -40,12 +40,14 @@ class LinkTable:
         interface: (H, H) interface of a host towards another one; UNKNOWN: not measured.
         facing: (H, H) the interface of the other one: `interface`, transposed.
         rate: (H, K) bytes a second that the interface can carry; NaN: not known.
+        allowed: (H, K) bytes a second that flows may use; NaN: not known.
         traffic: (H, K) bytes a second that the interface carries, as measured.
         flowing: (H, K) sum of the known flows that cross the interface, bytes a second.
         limit: (H,) fraction of the rate that flows may use.
-        usable: (H, K) bytes a second that flows may use; inf: not known.
+        usable: (H, K) `allowed`, or inf.
         load: (H, K) the greater one of `traffic` and `flowing`.
         room: (H, K) `usable` without `load`; inf: not known.
+        least_room: (H,) the least room of the host's interfaces.
         cells: (H,) index of the first cell of each host in the flat (H, K) arrays.
         crossings: pair of processes to the flow between their hosts.
         version: counter of changes.
@@ -64,8 +66,10 @@ class LinkTable:
         self.traffic: FloatArray = np.zeros((side, UNKNOWN + 1))
         self.flowing: FloatArray = np.zeros((side, UNKNOWN + 1))
         self.load: FloatArray = np.zeros((side, UNKNOWN + 1))
+        self.allowed: FloatArray = self.rate.copy()
         self.usable: FloatArray = np.full((side, UNKNOWN + 1), np.inf)
         self.room: FloatArray = self.usable.copy()
+        self.least_room: FloatArray = np.full(side, np.inf)
         self.cells = np.arange(side) * (UNKNOWN + 1)
         self.limit: FloatArray = np.ones(side)
         self.facing = self.interface.T.copy()
@@ -150,11 +154,13 @@ class LinkTable:
 
     def _count_again(self) -> None:
         """Add up all flows again, because rates or the interfaces between hosts have changed."""
-        self.usable = np.where(np.isnan(self.rate), np.inf, self.rate * self.limit[:, None])
+        self.allowed = self.rate * self.limit[:, None]
+        self.usable = np.where(np.isnan(self.allowed), np.inf, self.allowed)
         self.facing = self.interface.T.copy()
         self.flowing[:] = 0.0
         self.load[:] = self.traffic
         np.subtract(self.usable, self.load, out=self.room)
+        self.room.min(axis=1, out=self.least_room)
         for crossing in self.crossings.values():
             self._add(crossing, crossing.rate)
         self.version += 1
@@ -164,6 +170,7 @@ class LinkTable:
             flowing = self.flowing[row, number] = max(0.0, self.flowing[row, number] + rate)
             load = self.load[row, number] = max(flowing, self.traffic[row, number])
             self.room[row, number] = self.usable[row, number] - load
+            self.least_room[row] = self.room[row].min()
 
     def ends(self, crossing: Crossing) -> tuple[tuple[int, int], tuple[int, int]]:
         """Return row and interface of both ends of a flow."""
