@@ -229,11 +229,12 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return state.neighbours.separated[process.name][0]
     if position and (awaited := awaited_neighbour(state, process)):
         return awaited
-    room = state.preemption.room_made.get(process.name)
-    if process.phase is not ProcessPhase.QUEUED or position <= 1 or room is not None:
+    made = state.preemption.room_made.get(process.name) if position else None
+    room = made.reason if made is not None else ""
+    if position <= 1 or room:
         owner = state.instances.get(process.owner)
         reason = reason_of(state, process) or _awaited_node(process, owner)
-        return f"{reason}; {room.reason}" if room and room.reason != reason else reason
+        return f"{reason}; {room}" if room and room != reason else reason
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
 
