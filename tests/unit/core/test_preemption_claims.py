@@ -19,6 +19,8 @@ from rosrm.model.records import Record
 from tests.unit.core.cluster import MIB, Cluster, Machine, movable, process
 
 LOW, URGENT = [f"p{i}" for i in range(6)], ["u0", "u1", "u2"]
+#: Sizes of the first processes: urgent ones then need the room of several, or of few large ones.
+FILLS = {"small": (100,) * 6, "large": (150, 150, 150, 150, 100, 100)}
 HOSTS = {"a": 600, "b": 500, "c": 300}
 low, urgent, hosts = st.sampled_from(LOW), st.sampled_from(URGENT), st.sampled_from(list(HOSTS))
 chance, seldom = st.booleans(), st.sampled_from([False, False, False, True])
@@ -30,21 +32,24 @@ LONGEST = 120.0 * len(LOW + URGENT) + 2.0
 class Claims(RuleBasedStateMachine):
     """Rules of the state machine; `look` checks the guarantees after each step of the core."""
 
-    @initialize(mode=st.sampled_from(["move", "requeue"]), backfill=chance, most=st.integers(1, 2))
-    def begin(self, mode: str, backfill: bool, most: int) -> None:
+    @initialize(
+        mode=st.sampled_from(["move", "requeue"]), backfill=chance, most=st.sampled_from([1, 1, 2]),
+        fill=st.sampled_from(list(FILLS)),
+    )  # fmt: skip
+    def begin(self, mode: str, backfill: bool, most: int, fill: str) -> None:
         self.cluster = Cluster(
             preemption=mode, backfill=backfill, max_migrations=most, hysteresis=1.0, cooldown=2.0,
             headroom=0.0, automatic=False,
         )  # fmt: skip
-        #: Claimed column by process name, and the time since when it has been claimed.
-        self.claims: dict[str, tuple[int, float]] = {}
+        #: By process name: the claimed column, since when, and since when the process is queued.
+        self.claims: dict[str, tuple[int, float, float]] = {}
         self.moving: set[str] = set()
         self.cluster.watch = self.look
         for name, memory in HOSTS.items():
             limits, busy = {"memory": 1.0, "cpu": 1.0}, {"memory": 0.0, "cpu": 0.0}
             self.cluster.add(Machine(name, memory=memory * MIB, cpu=64.0, busy=busy, limits=limits))
-        for name, memory in zip(LOW, (300, 200, 300, 100), strict=False):
-            self.submit(name, memory, 0, moves=True, protect=name == "p1")
+        for name, memory in zip(LOW, FILLS[fill], strict=True):
+            self.submit(name, memory, 0, moves=True, protect=name == "p5")
 
     # --- events --------------------------------------------------------------------------
 
@@ -63,9 +68,12 @@ class Claims(RuleBasedStateMachine):
         self.submit(name, memory, priority, moves=not fixed, protect=protect)
 
     @rule(name=urgent, memory=st.sampled_from([250, 350, 450, 550]), priority=st.integers(1, 4),
-          time=seconds)  # fmt: skip
-    def submit_an_urgent_one(self, name: str, memory: int, priority: int, time: float) -> None:
-        """Submit a process that often fits only after others have made room."""
+          stubborn=chance, time=seconds)  # fmt: skip
+    def submit_an_urgent_one(
+        self, name: str, memory: int, priority: int, stubborn: bool, time: float
+    ) -> None:  # fmt: skip
+        """Submit a process that often fits only after others have made room, or that never do."""
+        self.do_not_stop(set(LOW), stubborn)
         self.cluster.cancel(name)
         self.submit(name, memory, priority, moves=False, protect=False)
         self.cluster.wait(time, tick=0.5)
@@ -106,6 +114,8 @@ class Claims(RuleBasedStateMachine):
 
     @rule()
     def master_restarts(self) -> None:
+        """Restart the master; it finds moves and stops under way, and claims their hosts again."""
+        self.claims.clear()
         self.cluster.restart_master()
 
     # --- guarantees ----------------------------------------------------------------------
@@ -131,7 +141,7 @@ class Claims(RuleBasedStateMachine):
     def look_at_room(self, name: str, column: int) -> None:
         """Check that no process takes room that is made for one of a higher priority."""
         claimed = self.cluster.state.hosts.claims.get(column, -inf)
-        if any(at == column for at, _ in self.claims.values()):  # since before this step
+        if any(at == column for at, *_ in self.claims.values()):  # since before this step
             assert self.cluster.state.processes[name].spec.priority >= claimed, "room is taken"
 
     def look_at_moves(self) -> None:
@@ -149,17 +159,16 @@ class Claims(RuleBasedStateMachine):
         state, now = self.cluster.state, self.cluster.now
         made = state.preemption.room_made
         present = {name: room.host.column for name, room in made.items() if room.host is not None}
-        for name, (column, since) in list(self.claims.items()):
+        for name, (column, since, queued) in list(self.claims.items()):
             if present.get(name) == column:
                 assert now - since <= LONGEST, f"{name} claims a host for too long"
                 continue
             del self.claims[name]
-            given_up = made.get(name)
-            if name in state.queue and given_up is not None:
-                assert given_up.reason
-                assert decide_now(state, state.processes[name]).column < 0
+            if name in state.queue and state.processes[name].since == queued:
+                fits = decide_now(state, state.processes[name]).column >= 0
+                assert fits or (name in made and made[name].reason), "a claim is lost"
         for name, column in present.items():
-            self.claims.setdefault(name, (column, now))
+            self.claims.setdefault(name, (column, now, state.processes[name].since))
 
     def teardown(self) -> None:
         """Let time pass: all claims end, although some processes never stop."""
@@ -173,4 +182,4 @@ class Claims(RuleBasedStateMachine):
 
 
 TestClaims = Claims.TestCase
-TestClaims.settings = settings(max_examples=40, stateful_step_count=20, deadline=None)
+TestClaims.settings = settings(max_examples=100, stateful_step_count=20, deadline=None)
