@@ -72,8 +72,8 @@ class ReschedulePolicy:
     """Starts of a failed process on other hosts, once its restart policy has given up.
 
     Attributes:
-        attempts: highest number of other hosts; 0: the process has failed. A process that ran for
-            `restart.window` counts from zero again.
+        attempts: highest number of starts on other hosts; 0: the process has failed. A service
+            counts from zero again after a run of `restart.window` or longer; a job never does.
         delay: seconds before each attempt.
     """
 

@@ -14,7 +14,7 @@ from rosrm.core.master.hosts.devices import note_devices
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
-from rosrm.core.master.rescheduling import next_attempt
+from rosrm.core.master.rescheduling import next_attempt, note_run
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.learned_needs import NO_NEEDS
 from rosrm.core.master.state.migration import End, Migration
@@ -153,6 +153,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
         state.save(process)
     if process.restarts != status.restarts:
         process.phase_before_loss = None  # restarted while its host was silent
+        note_run(process, status)  # of the run before the restart
     process.restarts = status.restarts
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_instance(state, instance, now)
@@ -330,7 +331,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     else:
         reason = status.message or f"exit code {status.exit_code}"
         unreachable = state.hosts.why_unreachable(host)  # then `host_loss` has decided
-        again = "" if unreachable else next_attempt(process, host, status, reason, now)
+        again = "" if unreachable else next_attempt(process, host, status, reason)
         if again:
             _requeue(state, process, host, now, again)
         else:

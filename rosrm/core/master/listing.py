@@ -19,7 +19,7 @@ from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Pro
 from rosrm.model.limits import limits_in_words
 from rosrm.model.rows import DeviceRow, HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy, qualified_name
-from rosrm.wording import amount
+from rosrm.wording import amount, listed
 
 _CONDITION: Final = {
     HostCondition.UP: "up",
@@ -229,11 +229,12 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return state.neighbours.separated[process.name][0]
     if position and (awaited := awaited_neighbour(state, process)):
         return awaited
-    room = state.preemption.room_made.get(process.name)
-    if process.phase is not ProcessPhase.QUEUED or position <= 1 or room is not None:
+    made = state.preemption.room_made.get(process.name) if position else None
+    room = made.reason if made is not None else ""
+    if position <= 1 or room:
         owner = state.instances.get(process.owner)
         reason = reason_of(state, process) or _awaited_node(process, owner)
-        return f"{reason}; {room.reason}" if room and room.reason != reason else reason
+        return f"{reason}; {room}" if room and room != reason else reason
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
 
@@ -252,9 +253,19 @@ def _advice(state: MasterState, process: Process) -> str:
             f"corrected one"
         )
         return f"{logs}, {again}" if process.ended_on else again
+    again = _advice_to_try_again(process) if process.phase in WAITING else ""
     if process.phase is ProcessPhase.SET_ASIDE:
-        return (
+        aside = (
             f"it is queued again when such a host registers; to change what it needs, run "
             f"`rosrm cancel {process.name}` and submit it again"
         )
-    return ""
+        return f"{aside}; {again}" if again else aside
+    return again
+
+
+def _advice_to_try_again(process: Process) -> str:
+    """Return the commands for a waiting process that has failed on hosts; "": it has not."""
+    if not process.failed_on:
+        return ""
+    name, hosts = process.name, listed(process.failed_on)
+    return f"`rosrm logs {name}` shows its output, `rosrm restart {name}` tries {hosts} again"

@@ -233,6 +233,7 @@ class MasterState:
                 "image": process.image and to_plain(process.image),
                 **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
                 "excluded": dict(process.excluded),
+                "failed_on": process.failed_on and to_plain(process.failed_on),
             },
         )  # fmt: skip
 

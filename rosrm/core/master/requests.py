@@ -21,6 +21,7 @@ from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
+from rosrm.core.master.rescheduling import forget_failures
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
@@ -296,6 +297,8 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
 
 
 def _restart_fault(state: MasterState, process: Process) -> str:
+    if process.phase in WAITING and process.forbidden_hosts:
+        return ""  # the restart allows these hosts again
     if process.phase is ProcessPhase.SET_ASIDE:
         return f"{process.name} is set aside: {process.reason}"
     if process.phase in WAITING:
@@ -319,11 +322,13 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
     if process.phase.is_terminal or process.image is not None:
         images.drop(state, process)
         replication.drop_former_replicas(state, process)
-        process.excluded.clear()
-        process.demand = None
-        process.reschedules, process.queue_delay = 0, 0.0
+        _allow_every_host(process)
         process.order = state.next_order
         state.next_order += 1
+        state.enqueue(process, now)
+    elif process.phase in WAITING:
+        state.unqueue(process)
+        _allow_every_host(process)
         state.enqueue(process, now)
     elif (owner := state.instances[process.owner]).state is not None:
         # An instance that its slave has not accepted yet starts without this order. An order to
@@ -331,6 +336,11 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         owner.restarting = True
         state.send(owner.host, RestartInstance(owner.id))
     state.save(process)
+
+
+def _allow_every_host(process: Process) -> None:
+    process.excluded.clear()
+    forget_failures(process)
 
 
 # --- migrate, cordon, drain -------------------------------------------------------------------

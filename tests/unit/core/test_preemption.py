@@ -12,6 +12,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from rosrm.core.master.migration.preemption import Group, covering_sets, rank
+from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.model.values import NeighbourRule, ProcessSpec
@@ -251,6 +252,123 @@ def test_room_is_made_only_once_on_a_host_that_a_policy_excludes() -> None:
     cluster.wait(60.0, tick=0.5)
     assert len(cluster.recorded("preempted")) == 2
     assert (cluster.where("x"), cluster.state.hosts.claims) == (["a"], {})
+
+
+# --- claims -----------------------------------------------------------------------------------
+
+
+def claimed(**settings: Any) -> Cluster:
+    """Return a cluster in which room is made on a for p, and x does not leave."""
+    cluster = two_hosts(**settings)
+    cluster.machines["a"].stubborn.add("x")
+    cluster.submit(process("p", memory=450, priority=5))
+    cluster.wait(3.0)
+    assert cluster.state.hosts.claims == {0: 5}
+    return cluster
+
+
+def let_go_and_place(cluster: Cluster) -> None:
+    """End the move of x; p then runs in its place."""
+    cluster.let_go("x")
+    cluster.wait(1.5)
+    assert (cluster.where("p"), cluster.state.hosts.claims) == (["a"], {})
+
+
+def test_a_claim_stands_while_other_moves_use_the_bound() -> None:
+    """The next move of the set waits for its turn."""
+    cluster = cluster_of(machine("a", 700), machine("b", 650), machine("c", 100), max_migrations=1)
+    filled(cluster, "a", *(movable(name, memory=200) for name in "xyz"))
+    filled(cluster, "b", movable("q", memory=50, protect=True))
+    cluster.submit(process("p", memory=650, priority=5))
+    cluster.machines["a"].stubborn.update("xyz")
+    cluster.machines["b"].stubborn.add("q")
+    cluster.wait(5.0)
+    (first,) = cluster.state.migrations
+    cluster.let_go(first)
+    assert cluster.migrate("q", "c").accepted
+    for _ in range(10):
+        cluster.wait(1.0)
+        assert (list(cluster.state.migrations), cluster.state.hosts.claims) == (["q"], {0: 5})
+    reason = "no process can make room yet: other moves are under way (`migration.max_in_flight`)"
+    assert reason in cluster.explain("p")["reason"]
+    cluster.let_go("q", on="b")
+    for _ in range(2):
+        cluster.wait(5.0)
+        (name,) = cluster.state.migrations
+        cluster.let_go(name)
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["a"]
+
+
+@pytest.mark.parametrize("backfill", [False, True])
+def test_a_claim_stands_while_processes_of_a_higher_priority_wait_before_it(backfill: bool) -> None:
+    """However many they are."""
+    cluster = claimed(backfill=backfill)
+    higher = [process(f"h{i}", memory=850, priority=9) for i in range(6)]
+    cluster.submit(*higher)
+    cluster.wait(3.0)
+    assert cluster.state.hosts.claims == {0: 5}
+    assert "x leaves a to make room" in cluster.explain("p")["reason"]
+    cluster.cancel(*(one.name for one in higher))
+    let_go_and_place(cluster)
+
+
+def test_a_claim_stands_while_the_master_assigns_no_work() -> None:
+    """The master waits for all hosts, because its journal has lost records."""
+    cluster = claimed(lease=60.0)
+    journal_gap.begin(cluster.state, 0, cluster.now, machine_rebooted=False)
+    cluster.cut("b", seconds=2.0)
+    cluster.machines["b"].restart_slave(cluster.now)
+    cluster.machines["b"].connected = True
+    assert cluster.register(cluster.machines["b"], journal_seen=10).accepted
+    cluster.wait(5.0)
+    assert "the journal has lost its newest records" in cluster["p"].reason
+    assert cluster.state.hosts.claims == {0: 5}
+    cluster.wait(60.0, tick=1.0)
+    let_go_and_place(cluster)
+
+
+def test_a_claim_stands_while_its_host_is_silent_for_a_moment() -> None:
+    """Its processes leave later, and not in vain."""
+    cluster = claimed()
+    cluster.cut("a", seconds=4.0)
+    cluster.reconnect("a", seconds=2.0)
+    assert cluster.state.hosts.claims == {0: 5}
+    let_go_and_place(cluster)
+
+
+def test_a_claim_ends_if_processes_do_not_leave_in_time() -> None:
+    """The explanation names them, and the host is not claimed again for the process."""
+    cluster = cluster_of(machine("a", 600), preemption="requeue")
+    filled(cluster, "a", process("x", memory=400))
+    cluster.machines["a"].stubborn.add("x")
+    cluster.submit(job("p", memory=500, priority=5))
+    cluster.wait(100.0, tick=0.5)
+    assert cluster.state.hosts.claims == {0: 5}
+    cluster.wait(30.0, tick=0.5)
+    assert cluster.state.hosts.claims == {}
+    assert "x did not leave a in time to make room" in cluster.explain("p")["reason"]
+    cluster.wait(60.0, tick=0.5)
+    assert cluster.state.hosts.claims == {}
+    cluster.cancel("p")
+    cluster.submit(job("p", memory=550, priority=5))  # another process, for which it is tried again
+    cluster.wait(2.5)
+    assert cluster.state.hosts.claims == {0: 5}
+    let_go_and_place(cluster)
+
+
+def test_two_processes_of_one_priority_do_not_count_on_the_same_room() -> None:
+    """The second one waits for the room of the first one, and then gets its own."""
+    cluster = cluster_of(machine("a", 800), preemption="requeue", backfill=True)
+    filled(cluster, "a", process("x", memory=390), process("y", memory=390))
+    cluster.machines["a"].stubborn.update("xy")
+    cluster.submit(*(process(name, memory=400, priority=5) for name in "pq"))
+    cluster.wait(10.0)
+    for name in "xy":
+        assert cluster.phase(name) == "stopping"
+        cluster.let_go(name)
+        cluster.wait(10.0)
+    assert (cluster.where("p"), cluster.where("q")) == (["a"], ["a"])
 
 
 # --- properties -------------------------------------------------------------------------------

@@ -143,3 +143,59 @@ def test_processes_on_one_host_by_rule_move_together() -> None:
     assert "move p and q from a" in rebalance(cluster)
     cluster.wait(3.0)
     assert (cluster.where("p"), cluster.where("q")) == (["b"], ["b"])
+
+
+# --- moves of a round that begin later -----------------------------------------------------------
+
+
+def half_begun(**settings: Any) -> Cluster:
+    """Return a cluster where p moves from a to b, and q is to follow."""
+    cluster = on_a(*four(), max_migrations=1, **settings)
+    cluster.machines["a"].stubborn.update("pqrs")
+    rebalance(cluster)
+    cluster.wait(1.0)
+    assert (list(cluster.state.migrations), cluster.state.rebalancing.pending) == (
+        ["p"], [("q", "b")],
+    )  # fmt: skip
+    return cluster
+
+
+def test_a_move_that_no_longer_evens_out_the_load_does_not_begin() -> None:
+    """The destination may have got other work since the plan; then q would move back later."""
+    cluster = half_begun()
+    cluster.machines["b"].busy["memory"] = 0.35
+    cluster.wait(1.0)
+    cluster.let_go("p")
+    cluster.wait(1.0)
+    assert (cluster.where("q"), cluster.state.rebalancing.pending) == (["a"], [])
+    (said,) = cluster.recorded("migration_refused")
+    assert said == "q is not moved: its move would not even out the load of a and b any more"
+
+
+def test_a_process_in_its_cool_down_does_not_move_later_in_the_round() -> None:
+    """A user has moved it after the plan."""
+    cluster = half_begun(cooldown=30.0)
+    cluster.add(machine("c"))
+    assert cluster.migrate("q", "c").accepted
+    cluster.let_go("q")
+    cluster.let_go("p")
+    cluster.wait(1.0)
+    assert (cluster.where("q"), cluster.state.rebalancing.pending) == (["c"], [])
+    assert cluster.recorded("migration_refused") == [
+        "q is not moved: q is in its cool-down of 30 s after a move"
+    ]
+
+
+def test_processes_on_one_host_by_rule_keep_to_the_bound_of_moves() -> None:
+    """They begin together once there is room for both."""
+    near = (NeighbourRule("near", ("q",)),)
+    pair = movable("q", memory=100), movable("r", memory=100, neighbours=near)
+    cluster = on_a(process("s", memory=300), movable("p", memory=180), *pair, max_migrations=2)
+    cluster.machines["a"].stubborn.update("pqr")
+    cluster.add(machine("c"))
+    cluster.state.rebalancing.pending = [("p", "b"), ("q", "c")]
+    cluster.wait(2.0)
+    assert list(cluster.state.migrations) == ["p"]
+    cluster.let_go("p")
+    cluster.wait(0.5)
+    assert sorted(cluster.state.migrations) == ["q", "r"]

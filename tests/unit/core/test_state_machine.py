@@ -852,7 +852,8 @@ class Play(RuleBasedStateMachine):
             if process.phase is ProcessPhase.FINISHED:
                 assert process.name in self.completed
             for host in process.excluded:
-                assert (process.name, host) in self.missing or process.reschedules
+                assert (process.name, host) in self.missing
+            assert len(process.failed_on) <= process.reschedules
             if process.phase is ProcessPhase.FAILED and not process.spec.ros:
                 missing = {name for name, _ in self.missing}
                 host_lost = process.spec.host_loss.then == "stop"

@@ -22,6 +22,7 @@ from rosrm.core.master.commands import Assign
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_gap import why_no_work
+from rosrm.core.master.rescheduling import failures
 from rosrm.core.master.scheduling.decision import Decision, decide
 from rosrm.core.master.scheduling.feasibility import (
     a_known_host_may,
@@ -62,7 +63,7 @@ def demand_of(state: MasterState, process: Process) -> Demand:
     ):
         needs = state.estimate(process.spec)
         demand = Demand(
-            process.spec, needs.amounts, needs.estimated, dict(process.excluded), near=near,
+            process.spec, needs.amounts, needs.estimated, process.forbidden_hosts, near=near,
             neighbours=neighbours, traffic=traffic, plugins=state.placement,
         )  # fmt: skip
         # Equal processes share one demand, because thousands of them may wait.
@@ -81,7 +82,7 @@ def demand_to_move(
         together: names of the processes that move with it to the same host.
     """
     excluded = {
-        **process.excluded, **unable(state, process, source), **lacking,
+        **process.forbidden_hosts, **unable(state, process, source), **lacking,
         source: "it is the source of the move",
     }  # fmt: skip
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))
@@ -369,6 +370,7 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
     state.queue.remove(process.name)
     if refused_everywhere(state.hosts, demand_of(state, process)):
         state.set_phase(process, ProcessPhase.FAILED, now, f"no host can start it: {reason}")
+        process.ended_on = next(reversed(process.failed_on), "")  # of its last run, with its logs
         state.note_decision(process, decide_now(state, process), "set_aside", now)
         state.record(
             now, EventKind.FAILED, f"{process.name} failed: {process.reason}", process=process.name
@@ -427,10 +429,16 @@ def _record_waiting(state: MasterState, process: Process, demand: Demand, now: f
         return
     room = state.preemption.room_made.get(process.name)
     made = room.reason if room is not None and room.host is not None else ""
-    reason = why_all_away(state.hosts, demand) or made or "no host can take it now"
+    reason = why_all_away(state.hosts, demand) or made or _why_waiting(process)
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _record_wait_reason(state, process, reason, now, {"decision": process.decision})
+
+
+def _why_waiting(process: Process) -> str:
+    failed = failures(process)
+    no_host = f"it failed on {failed}, and no other host can" if failed else "no host can"
+    return f"{no_host} take it now"
 
 
 def _record_wait_reason(

@@ -22,7 +22,7 @@ from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.recovery.journal_gap import note_seen
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
-from rosrm.core.master.state.process import DesiredState, Instance, ProcessPhase
+from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.codec import to_plain
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
@@ -162,9 +162,18 @@ def _clear_exclusions(state: MasterState, host: Host) -> None:
         if process.phase is ProcessPhase.CANCELLED and process.ended_on == host.name:
             process.reason = ""
     for process in state.processes.values():
-        if host.name in process.excluded and not process.phase.is_terminal:
-            del process.excluded[host.name]
-            process.demand = None
+        if not process.phase.is_terminal:
+            _clear_exclusion(process, host)
+
+
+def _clear_exclusion(process: Process, host: Host) -> None:
+    """Clear the exclusion of a host, unless the process failed there in this run of its slave."""
+    if process.excluded.pop(host.name, None) is not None:
+        process.demand = None
+    failure = process.failed_on.get(host.name)
+    if failure is not None and failure.incarnation != host.description.incarnation:
+        del process.failed_on[host.name]
+        process.demand = None
 
 
 def _name_taken(state: MasterState, known: Host | None, event: happened.HostRegistered) -> str:

@@ -386,7 +386,7 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
         return reason
     # Only labels, resources and exclusions count here. A missing capability, or a lost host, may
     # change later.
-    lasting = {**process.excluded, source.name: "it is there"}
+    lasting = {**process.forbidden_hosts, source.name: "it is there"}
     measured = measured_need(state, instance.measured)
     amounts, estimated = demand_amounts(state, process, measured)
     demand = Demand(process.spec, amounts, estimated, lasting, plugins=state.placement)

@@ -3,7 +3,8 @@
 They move to other hosts. With `preemption: requeue`, those that cannot move wait in the queue
 again. The set with the fewest processes is chosen; of equal sets the one with the lowest
 priorities. Until the process is placed, its host takes no process of a lower priority; otherwise
-that one could take the room.
+that one could take the room. Such a claim ends with the placement, when the process does not fit in
+spite of the room, or at its deadline.
 
 A set is a union of groups: processes that must stay on one host leave it together.
 """
@@ -30,7 +31,7 @@ from rosrm.core.master.migration.room import (
     trial,
     why_it_cannot_move,
 )
-from rosrm.core.master.migration.start import moves_under_way
+from rosrm.core.master.migration.start import may_begin
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.recovery.journal_gap import why_no_work
 from rosrm.core.master.scheduling.candidates import candidates
@@ -49,6 +50,8 @@ _EVERY: Final = 1.0
 _GRACE: Final = 5.0
 #: Seconds after the last departure, after which the readings of a host show it.
 _SHOWN: Final = 2.0
+#: Seconds for each process of a set, after which a host is given up that they have not left.
+_LONGEST: Final = 120.0
 #: Most waiting processes, hosts of each, and sets of each host that one review considers.
 _MOST_WAITING: Final = 4
 _MOST_HOSTS: Final = 32
@@ -84,6 +87,7 @@ class _Search:
 
     Attributes:
         tried: names of hosts where the process did not fit in spite of the room.
+        claim: room that is being made for the process; None: none is.
         against: reasons why processes of lower priorities cannot make room.
         stuck: names of processes that cannot leave their host, whichever others do.
     """
@@ -91,19 +95,48 @@ class _Search:
     process: Process
     ranking: Ranking
     tried: frozenset[str]
+    claim: RoomMade | None
     against: list[str] = field(default_factory=list)
     stuck: set[str] = field(default_factory=set)
+
+    def deadline(self, departures: int, now: float) -> float:
+        """Return the deadline of a claim; a claim that continues keeps its own."""
+        return now + departures * _LONGEST if self.claim is None else self.claim.deadline
 
 
 def preempt(state: MasterState, now: float) -> None:
     """Make room for the first waiting processes that fit nowhere, or continue to make it."""
-    if now - state.preemption.reviewed < _EVERY:
+    known, last = state.preemption, state.preemption.reviewed
+    if now - last < _EVERY:
         return
-    state.preemption.reviewed = now
-    waits = state.settings.preemption and len(state.queue) and not why_no_work(state, now)
-    waiting = list(_waiting(state, now)) if waits else []
-    made = {one.name: _review(state, one, now) for one in waiting}
-    state.preemption.room_made = {name: room for name, room in made.items() if room is not None}
+    known.reviewed = now
+    if not state.settings.preemption:
+        known.room_made.clear()
+    for name in list(known.room_made):
+        if name not in state.queue or state.processes[name].since > last:  # placed, or another one
+            del known.room_made[name]
+    _set_claims(state)
+    if not state.settings.preemption or not len(state.queue) or why_no_work(state, now):
+        return  # while the master assigns no work, the claims stand as they are
+    _review_waiting(state, now)
+
+
+def _review_waiting(state: MasterState, now: float) -> None:
+    """Review the first waiting processes, and all for which room is being made."""
+    made = state.preemption.room_made
+    claimed = [state.processes[name] for name, room in made.items() if room.host is not None]
+    due = {one.name: one for one in (*claimed, *_waiting(state, now))}
+    for process in sorted(due.values(), key=lambda one: state.queue.position(one.name)):
+        room = _review(state, process, made.pop(process.name, None), now)
+        if room is not None:
+            made[process.name] = room
+        _set_claims(state)
+    for name in made.keys() - due.keys():
+        made[name] = replace(made[name], reason="")  # the process is not among the first any more
+
+
+def _set_claims(state: MasterState) -> None:
+    """Reserve each host on which room is made for the highest priority for which it is."""
     claims: dict[int, int] = {}
     for name, room in state.preemption.room_made.items():
         if room.host is not None:
@@ -123,52 +156,82 @@ def _waiting(state: MasterState, now: float) -> Iterator[Process]:
             return
         if name in state.queue.delayed or awaited_neighbour(state, process):
             continue
-        if name in state.preemption.room_made or now - process.since >= state.settings.hysteresis:
+        if now - process.since >= state.settings.hysteresis:
             yield process
         found += 1
         if not state.settings.backfill:
             return
 
 
-def _review(state: MasterState, process: Process, now: float) -> RoomMade | None:
+def _review(
+    state: MasterState, process: Process, before: RoomMade | None, now: float
+) -> RoomMade | None:
     """Return the room that is made for a process; None: it needs none."""
+    claim = before if before is not None and before.host is not None else None
     ranking = ranking_of(state, demand_of(state, process))
-    if ranking.best() >= 0:
-        return None
-    before = state.preemption.room_made.get(process.name)
-    if before is not None and now < before.until and before.host is None:
+    if ranking.best() >= 0:  # the claim stands until the process is placed
+        return claim if claim is not None and now < claim.deadline else None
+    if before is not None and claim is None and now < before.until:
         return before
-    search = _Search(process, ranking, before.tried if before is not None else frozenset())
-    if before is not None and before.host is not None:
-        return _continue(state, search, before.host, before, now)
-    for host, missing in _hosts_in_question(state, search):
+    tried = before.tried if before is not None else frozenset()
+    search = _Search(process, ranking, tried, claim)
+    if claim is not None:
+        return _continue(state, search, claim, now)
+    hosts = [
+        one for one in _hosts_in_question(state, search)
+        if process.spec.priority > state.hosts.claims.get(one[0].column, -inf)
+    ]  # fmt: skip
+    for host, missing in hosts:
         if (missing - _leaving(state, host) <= CLOSE).all():  # also after a restart of the master
             return _wait_for_room(state, search, host, now)
-    return _make_room(state, search, _hosts_in_question(state, search), now)
+    return _make_room(state, search, hosts, now)
 
 
-def _continue(
-    state: MasterState, search: _Search, host: Host, before: RoomMade, now: float
-) -> RoomMade | None:
+def _continue(state: MasterState, search: _Search, claim: RoomMade, now: float) -> RoomMade:
     """Wait for the departures from a host, and begin those that had to wait for their turn."""
+    host = claim.host
+    assert host is not None
+    if now >= claim.deadline:
+        return _expired(state, search, host, now)
     leaving = _leaving(state, host)
-    if not leaving.any() and not (before.partial and now >= before.until - _GRACE + _SHOWN):
-        if now < before.until:
-            return before
-        return _in_vain(state, search, host, now)
-    for one, missing in _hosts_in_question(state, search):
-        if one is host:
-            if (missing - leaving <= CLOSE).all():
-                return _wait_for_room(state, search, host, now)
-            if before.partial and leaving.any():
-                return replace(before, until=now + _GRACE)
-            return _make_room(state, search, [(host, missing)], now)
-    return _in_vain(state, search, host, now)
+    missing = next((lacks for one, lacks in _hosts_in_question(state, search) if one is host), None)
+    shown = claim.partial and now >= claim.until - _GRACE + _SHOWN
+    if missing is None or not (leaving.any() or shown):
+        return _wait_for_host(state, search, claim, now)
+    if (missing - leaving <= CLOSE).all():
+        return _wait_for_room(state, search, host, now)
+    if claim.partial and leaving.any():
+        return replace(claim, until=now + _GRACE)
+    return _make_room(state, search, [(host, missing)], now)
 
 
-def _in_vain(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
-    """Give up a host on which the process does not fit in spite of the room that was made."""
+def _wait_for_host(state: MasterState, search: _Search, claim: RoomMade, now: float) -> RoomMade:
+    """Wait for the readings of a host, and while it cannot take the process for another reason.
+
+    A host may be suspect or have a stale reading for a moment, or is claimed for a higher priority.
+    """
+    host = claim.host
+    assert host is not None
+    taken = state.hosts.claims.get(host.column, -inf) > search.process.spec.priority
+    if taken or _leaving(state, host).any():
+        return replace(claim, until=now + _GRACE)
+    if now < claim.until:
+        return claim
     why = f"room was made on {host.name}, and the process does not fit there"
+    return _given_up(state, search, host, why, now)
+
+
+def _expired(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
+    """Give up a host that its processes do not leave in time."""
+    leaving = [one.id.process for one in state.instances_of(host) if is_leaving(state, one)]
+    why = f"{listed(sorted(leaving))} did not leave {host.name} in time to make room"
+    if not leaving:
+        why = f"the room on {host.name} could not be made in time"
+    return _given_up(state, search, host, why, now)
+
+
+def _given_up(state: MasterState, search: _Search, host: Host, why: str, now: float) -> RoomMade:
+    """Return the outcome for a host that is not tried again while the process waits."""
     tried = search.tried | {host.name}
     return RoomMade(None, why, now + state.settings.cooldown, tried=tried)
 
@@ -177,7 +240,8 @@ def _wait_for_room(state: MasterState, search: _Search, host: Host, now: float) 
     names = sorted(one.id.process for one in state.instances_of(host) if is_leaving(state, one))
     leave = "leaves" if len(names) == 1 else "leave"
     why = f"{listed(names)} {leave} {host.name} to make room"
-    return RoomMade(host, why, now + _GRACE, tried=search.tried)
+    deadline = search.deadline(len(names), now)
+    return RoomMade(host, why, now + _GRACE, tried=search.tried, deadline=deadline)
 
 
 def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, FloatArray]]:
@@ -386,7 +450,10 @@ def _begin(
     state: MasterState, search: _Search, host: Host, chosen: Sequence[Group],
     moves: Sequence[PlannedMoves | None], now: float,
 ) -> RoomMade:  # fmt: skip
-    """Let a set leave its host; moves beyond `max_migrations` begin in a later review."""
+    """Let a set leave its host; moves beyond `max_migrations` begin in a later review.
+
+    A host that is claimed already stays claimed while no move can begin.
+    """
     phrases, partial = [], False
     for group, planned in zip(chosen, moves, strict=True):
         names = listed([one.name for one in group.processes])
@@ -396,7 +463,7 @@ def _begin(
             phrases.append(f"{names} wait{'s' * (len(group.processes) == 1)} in the queue again")
             continue
         number = len(planned.steps)
-        if moves_under_way(state) + number > state.settings.max_migrations:
+        if not may_begin(state, number):
             partial = True
             continue
         for process in group.processes:
@@ -405,10 +472,13 @@ def _begin(
         begin_moves(state, planned, now)
         phrases.append(f"{names} move{'s' * (number == 1)} to {planned.destination.name}")
     if not phrases:
-        why = "other moves are under way (`migration.max_in_flight`)"
-        return RoomMade(None, f"no process can make room yet: {why}", now, tried=search.tried)
+        why = "no process can make room yet: other moves are under way (`migration.max_in_flight`)"
+        if search.claim is not None:
+            return replace(search.claim, reason=why, until=now + _GRACE, partial=True)
+        return RoomMade(None, why, now, tried=search.tried)
     why = f"room is made on {host.name}: {'; '.join(phrases)}"
-    return RoomMade(host, why, now + _GRACE, partial, search.tried)
+    deadline = search.deadline(sum(len(group.processes) for group in chosen), now)
+    return RoomMade(host, why, now + _GRACE, partial, search.tried, deadline)
 
 
 def _requeue(

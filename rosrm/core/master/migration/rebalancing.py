@@ -16,9 +16,9 @@ import numpy as np
 
 from rosrm.core.master.assignment.neighbours import running_with
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration.eviction import PlannedMoves, plan_moves, try_move
+from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
 from rosrm.core.master.migration.room import is_leaving, share_of, trial, why_it_cannot_move
-from rosrm.core.master.migration.start import moves_under_way
+from rosrm.core.master.migration.start import may_begin, moves_under_way
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -127,16 +127,34 @@ def begin_round(state: MasterState, planned: Round, now: float) -> None:
 def _begin_pending(state: MasterState, now: float) -> None:
     pending = state.rebalancing.pending
     while pending and moves_under_way(state) < state.settings.max_migrations:
-        name, destination = pending.pop(0)
+        name, destination = pending[0]
         process, host = state.processes.get(name), state.hosts.by_name[destination]
+        if process is not None and not may_begin(state, 1 + len(running_with(state, process))):
+            return
+        del pending[0]
         if process is None or process.phase.is_terminal:
             continue
-        rejected = try_move(
-            state, process, _CAUSE, now, headroom=state.settings.headroom, host=host
-        )
-        if rejected is not None:
-            message = f"{name} is not moved: {rejected.reason}"
+        planned = _plan_again(state, process, host, now)
+        if isinstance(planned, Rejected):
+            message = f"{name} is not moved: {planned.reason}"
             state.record(now, EventKind.MIGRATION_REFUSED, message, process=name)
+        else:
+            begin_moves(state, planned, now)
+
+
+def _plan_again(
+    state: MasterState, process: Process, host: Host, now: float
+) -> PlannedMoves | Rejected:
+    """Return the move of a round that could not begin at once, unless it gains nothing any more."""
+    planned = _plan(state, process, now, host)
+    if isinstance(planned, Rejected):
+        return planned
+    source = state.instances[process.owner].host
+    if _gains(_shift(state, planned, source, np.zeros_like(state.hosts.busy))):
+        return planned
+    return Rejected(
+        f"its move would not even out the load of {source.name} and {host.name} any more"
+    )
 
 
 # --- the plan ---------------------------------------------------------------------------------
@@ -207,16 +225,25 @@ def _shifts_from(state: MasterState, source: Host, planned: Round, now: float) -
             planned.against.append(moves.reason)
             continue
         shift = _shift(state, moves, source, planned.freed)
-        if max(shift.after) <= shift.before[0] - _LEAST_GAIN:
+        if _gains(shift):
             yield shift
 
 
-def _plan(state: MasterState, process: Process, now: float) -> PlannedMoves | Rejected:
+def _gains(shift: Shift) -> bool:
+    """Return True if both hosts of a move are then less loaded than its source was before."""
+    return max(shift.after) <= shift.before[0] - _LEAST_GAIN
+
+
+def _plan(
+    state: MasterState, process: Process, now: float, host: Host | None = None
+) -> PlannedMoves | Rejected:
+    """Plan the move of a process to the best host, or to a given one."""
     for one in (process, *running_with(state, process)):
         why = _why_it_stays(state, one, now)
         if why:
             return Rejected(why)
-    return plan_moves(state, process, _CAUSE, now, headroom=state.settings.headroom)
+    headroom = state.settings.headroom
+    return plan_moves(state, process, _CAUSE, now, headroom=headroom, host=host)
 
 
 def _shift(state: MasterState, planned: PlannedMoves, source: Host, freed: FloatArray) -> Shift:

@@ -102,7 +102,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
     A standby need not run near the neighbours of the process, but must run apart from others.
     """
     own = demand_of(state, process)
-    excluded = {**process.excluded, primary.name: "the primary runs there"}
+    excluded = {**process.forbidden_hosts, primary.name: "the primary runs there"}
     labels = primary.description.labels
     spread = [rule.by for rule in process.spec.neighbours if rule.group and not rule.prefer]
     apart_by = dict.fromkeys((*process.spec.standby.apart_by, *filter(None, spread)))

@@ -95,6 +95,16 @@ def moves_under_way(state: MasterState) -> int:
     return sum(not migration.stuck for migration in state.migrations.values())
 
 
+def may_begin(state: MasterState, number: int) -> bool:
+    """Return True if the bound on migrations in flight allows so many moves, which begin together.
+
+    More moves than the bound, of processes that must stay on one host, wait until none is in
+    flight.
+    """
+    in_flight = moves_under_way(state)
+    return not in_flight or in_flight + number <= state.settings.max_migrations
+
+
 def why_busy(migration: Migration) -> str:
     """Return a sentence on the current migration of a process."""
     if migration.aim is Aim.MOVE:

@@ -14,12 +14,14 @@ class RoomMade:
 
     Attributes:
         host: where they leave; None: no set of them can make room.
-        reason: a sentence for `explain`.
+        reason: a sentence for `explain`; "": not known now.
         until: time until which the host is reserved, although nothing leaves it any more; without a
             host, time before which the master does not look for a set again.
         partial: True: more processes must leave, whose moves had to wait for others.
         tried: names of hosts where room was made, but which a policy or a reading excludes for
-            another reason. They are not tried again while the process waits.
+            another reason, or that was not made in time. They are not tried again while the
+            process waits.
+        deadline: time at which the host is given up, whatever still leaves it.
     """
 
     host: Host | None
@@ -27,6 +29,7 @@ class RoomMade:
     until: float
     partial: bool = False
     tried: frozenset[str] = frozenset()
+    deadline: float = inf
 
 
 @dataclass(slots=True)

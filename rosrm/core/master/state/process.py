@@ -158,10 +158,23 @@ class Image:
     needs: Mapping[str, float] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """The failure of a process on a host, which excludes the host.
+
+    Attributes:
+        incarnation: run of the host's slave in which it happened; the next run ends the exclusion.
+    """
+
+    reason: str
+    incarnation: int
+
+
 #: Fields of a process that are journaled unchanged.
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
+    "failed_on",
 )  # fmt: skip
 
 
@@ -184,7 +197,8 @@ class Process:
             lower numbers are of another owner.
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
-        excluded: host name to the reason why the process cannot run there.
+        excluded: name of each host that has refused the process to the reason.
+        failed_on: name of each host that is excluded because the process failed there, in order.
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
             process runs.
         ended_on: name of the host of its last run; "": it has not ended, or never ran.
@@ -198,7 +212,7 @@ class Process:
         started_at: time at which it first started since it left the queue; inf: not yet.
         began: unix time of `started_at`; 0: not yet.
         overdue: True: its time limit has passed, and it is being stopped.
-        reschedules: number of hosts on which it has failed in a row.
+        reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
@@ -215,6 +229,7 @@ class Process:
     instances: set[int] = field(default_factory=set)
     reason: str = ""
     excluded: dict[str, str] = field(default_factory=dict)
+    failed_on: dict[str, Failure] = field(default_factory=dict)
     born: int = 0
     owned_from: int = 0
     migrations: int = 0
@@ -249,6 +264,14 @@ class Process:
     def name(self) -> str:
         """Return its name."""
         return self.spec.name
+
+    @property
+    def forbidden_hosts(self) -> dict[str, str]:
+        """Return host name to the reason why the process must not run there."""
+        failed = {
+            host: f"{self.name} failed there: {one.reason}" for host, one in self.failed_on.items()
+        }
+        return {**self.excluded, **failed}
 
     @property
     def placed_from(self) -> float:
