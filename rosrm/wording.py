@@ -87,11 +87,22 @@ def listed(names: Iterable[str], word: str = "and", most: int = 8) -> str:
 
 
 def by_reason(reasons: Iterable[tuple[str, str]]) -> str:
-    """Return names with their reasons, grouped by reason: "a and b: is lost; c: is full"."""
+    """Return names with their reasons, equal ones once: "each of a and b is lost; c: no room".
+
+    Args:
+        reasons: name and its reason; "it" at the beginning of a reason stands for the name.
+    """
     names: dict[str, list[str]] = {}
     for name, reason in reasons:
         names.setdefault(reason, []).append(name)
-    return "; ".join(f"{listed(alike, most=3)}: {reason}" for reason, alike in names.items())
+    return "; ".join(_of_all(alike, reason) for reason, alike in names.items())
+
+
+def _of_all(names: Sequence[str], reason: str) -> str:
+    if not reason.startswith("it "):
+        return f"{listed(names, most=3)}: {reason}"
+    subject = names[0] if len(names) == 1 else f"each of {listed(names, most=3)}"
+    return f"{subject} {reason.removeprefix('it ')}"
 
 
 def first_line(reason: str) -> str:

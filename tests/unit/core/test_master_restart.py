@@ -43,7 +43,7 @@ def test_the_reason_of_a_process_that_is_set_aside_follows_the_hosts() -> None:
     cluster = Cluster("a").with_processes(process("p", required_labels={"x": "y"}))
     cluster.add("b")
     cluster.wait(0.2)
-    assert cluster["p"].reason == "no host may take it: a and b: it lacks the label x=y"
+    assert cluster["p"].reason == "no host may take it: each of a and b lacks the label x=y"
     assert cluster.intents["process"]["p"]["reason"] == cluster["p"].reason
 
 

@@ -148,7 +148,7 @@ def test_apart_is_symmetric(declares: str) -> None:
     cluster = cluster_of("a", p, q)
     assert (cluster.where("p"), cluster.where("q")) == (["a"], [])
     assert cluster["q"].reason == (
-        "no host may take it: a: it runs p, apart from which the process must run; "
+        "no host may take it: a runs p, apart from which the process must run; "
         "there is no other host"
     )
     cluster.submit(process("other"))
@@ -172,9 +172,9 @@ def test_a_group_is_spread_over_the_values_of_a_label() -> None:
     cluster = cluster_of("abcx", *specs)
     assert [cluster.where(spec.name) for spec in specs] == [["a"], ["c"], []]
     assert cluster["p2"].reason == (
-        "no host may take it: a and b: it has rack=1, as the host of p0, apart from which the "
-        "process must run; c: it has rack=2, as the host of p1, apart from which the process must "
-        "run; x: it has no label 'rack', by which the process must run apart from others"
+        "no host may take it: each of a and b has rack=1, as the host of p0, apart from which the "
+        "process must run; c has rack=2, as the host of p1, apart from which the process must "
+        "run; x has no label 'rack', by which the process must run apart from others"
     )
 
 

@@ -90,7 +90,7 @@ def test_a_process_that_every_host_fails_for_good_is_set_aside(permanent, phase)
     cluster.submit(process("p"))
     assert cluster["p"].phase.value == phase
     if permanent:
-        assert "it is called a (filter named)" in cluster["p"].reason
+        assert "a is called a (filter named)" in cluster["p"].reason
 
 
 @pytest.mark.parametrize(

@@ -100,7 +100,7 @@ def test_no_reason_names_a_pruned_host() -> None:
     prune(cluster, hosts=("b",))
     cluster.set_host("a", "cordon")
     cluster.submit(process("p"))
-    assert cluster["p"].reason == "every host is away: a: it is cordoned"
+    assert cluster["p"].reason == "every host is away: a is cordoned"
     cluster.cancel("p", "live")
     cluster.leave("a")
     cluster.cut("a", seconds=1.0)

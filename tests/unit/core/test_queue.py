@@ -62,7 +62,7 @@ def test_a_process_that_no_host_may_take_is_set_aside() -> None:
     cluster = Cluster("a", Machine("b", labels={"gpu": "old"}))
     cluster.submit(process("p", required_labels={"gpu": "new"}), process("q"))
     assert cluster.phase("p") == "set_aside"
-    assert cluster["p"].reason == "no host may take it: a and b: it lacks the label gpu=new"
+    assert cluster["p"].reason == "no host may take it: each of a and b lacks the label gpu=new"
     assert cluster.where("q")
 
 
@@ -71,10 +71,10 @@ def test_a_process_too_large_for_every_host_is_set_aside() -> None:
     cluster = Cluster(Machine("a", memory=1000 * MIB)).with_processes(process("p", memory=900))
     assert cluster.phase("p") == "set_aside"
     assert cluster["p"].reason == (
-        "no host may take it: a: it has 1.0 GB of memory, of which 839 MB (80%) may be used; "
+        "no host may take it: a has 1.0 GB of memory, of which 839 MB (80%) may be used; "
         "needed: 944 MB; there is no other host"
     )
-    assert cluster.restart("p").message.startswith("p is set aside: no host may take it: a: ")
+    assert cluster.restart("p").message.startswith("p is set aside: no host may take it: a has ")
 
 
 def test_nothing_is_set_aside_before_the_limits_are_known(monkeypatch) -> None:
@@ -111,7 +111,7 @@ def test_a_wait_for_absent_hosts_has_that_reason() -> None:
     cluster.leave("a")
     cluster.cut("b", seconds=11.0)
     cluster.submit(process("p"))
-    assert cluster["p"].reason == "every host is away: a: it has left; b: it is lost"
+    assert cluster["p"].reason == "every host is away: a has left; b is lost"
     assert cluster.recorded("waits") == [f"p waits: {cluster['p'].reason}"]
 
 
@@ -148,7 +148,7 @@ def test_a_process_that_fits_on_a_cordoned_host_only_does_not_block_the_others()
     cluster.submit(process("special", required_labels={"gpu": "yes"}), process("plain"))
     assert cluster.where("plain") == ["a"]
     assert cluster.phase("special") == "set_aside"
-    assert "b: it is cordoned" in cluster["special"].reason
+    assert "b is cordoned" in cluster["special"].reason
     cluster.set_host("b", "uncordon")
     assert cluster.where("special") == ["b"]
 

@@ -163,7 +163,7 @@ def test_a_process_waits_for_room_on_another_host_and_says_where_it_failed() -> 
 def test_a_process_is_set_aside_while_the_other_hosts_are_away() -> None:
     """The reason names each host; the process blocks no other, and starts when one returns."""
     cluster = failed_on_a("cordoned")
-    reason = "no host may take it: a: p failed there: exit code 3; b: it is cordoned"
+    reason = "no host may take it: a: p failed there: exit code 3; b is cordoned"
     assert (cluster.phase("p"), cluster["p"].reason) == ("set_aside", reason)
     assert "`rosrm restart p` tries a again" in cluster.explain("p")["reason"]
     cluster.submit(process("q"))

@@ -84,7 +84,7 @@ def test_a_niceness_that_the_kernel_refuses(confinement, required: bool) -> None
         return processes[0].pid
 
     limits = LimitRule(nice=-17, required=required)
-    note = f"nice: it is {os.nice(0)}, because CAP_SYS_NICE is required for -17"
+    note = f"nice is {os.nice(0)}, because CAP_SYS_NICE is required for -17"
     try:
         if required:
             with pytest.raises(SpawnError, match=note):
