@@ -260,6 +260,9 @@ class LogReader:
             since = " since then" if self.selection.since else ""
             self.notify(f"{name} has written nothing{where}{since}")
             return
+        if self._away:
+            away = "; ".join(self._away.values())
+            raise Refused(f"no log of {name} is within reach{where}: {away}")
         state = "is no longer known to the master" if row is None else standing(row.state)
         reason = f": {row.reason}" if row is not None and row.reason else ""
         gone = "it was not started, or its log has been removed"

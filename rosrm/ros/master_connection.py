@@ -147,6 +147,17 @@ def _ask_until_answered(
     return answers
 
 
+def _about_security(endpoints: Endpoints) -> tuple[str, str]:
+    """Return the security of this side, and how to check that the master has the same."""
+    security = endpoints.security.described
+    if security == "none":
+        return "security: none", "A master with `security: keys` answers only clients with a key"
+    return security, (
+        "`rosrm key check` shows this user's keys, and `rosrm key list` on the machine of the "
+        "master the valid ones"
+    )
+
+
 def _greet(endpoints: Endpoints, name: str, timeout: float, begun: float) -> srv.Handshake.Response:
     """Return the master's greeting; raises `NoMaster` or `Refused`."""
     hello = find_master(endpoints, f"client {name}", timeout)
@@ -154,9 +165,8 @@ def _greet(endpoints: Endpoints, name: str, timeout: float, begun: float) -> srv
     if hello is None:
         raise NoMaster(
             f"no master answered within {time.monotonic() - begun:.1f} s ({settings.describe()}, "
-            f"namespace {settings.namespace}, {endpoints.security.described}). "
-            f"{_to_check(settings)} `rosrm key check` shows this user's keys, and `rosrm key list` "
-            f"on the machine of the master the valid ones"
+            f"namespace {settings.namespace}, {_about_security(endpoints)[0]}). "
+            f"{_to_check(settings)} {_about_security(endpoints)[1]}"
         )
     if not hello.accepted:
         raise Refused(hello.message, "version")

@@ -88,11 +88,12 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     owner = state.instances.get(process.owner)
     seen = owner.seen if owner else {}
     silence = _silence(state, owner, now)
-    phase = process.phase.value
+    phase, since = process.phase.value, now - process.since
     standby = process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
     reason = reason_of(state, process) or standby or _awaited_node(process, owner)
-    if silence and process.phase in _OBSERVED:
-        phase, reason = "unknown", f"{silence}; last known: {phase}"
+    if owner is not None and silence is not None and process.phase in _OBSERVED:
+        said = f"{owner.host.name} has been silent for {silence:.0f} s"
+        phase, reason, since = "unknown", f"{said}; last known: {phase}", silence
     cancelled = process.wanted is DesiredState.CANCEL and process.name not in state.migrations
     if owner is not None and cancelled:
         reason += _awaited(state, owner.host, now)
@@ -103,10 +104,10 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         host=_host_of(process, owner), number=process.owner,
         pid=owner.pid if owner else 0, restarts=process.restarts, migrations=process.migrations,
         exit_code=process.exit_code, priority=process.spec.priority,
-        queue_position=state.queue.position(process.name), since=now - process.since,
+        queue_position=state.queue.position(process.name), since=since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
         cpu_limit=_limit(process, owner, "cpu"), memory_limit=int(_limit(process, owner, "memory")),
-        stale=bool(silence), owner=process.principal,
+        stale=silence is not None, owner=process.principal,
     )  # fmt: skip
 
 
@@ -116,12 +117,11 @@ def _limit(process: Process, owner: Instance | None, name: str) -> float:
     return float(getattr(process.spec.limits, name)) if holds else 0.0
 
 
-def _silence(state: MasterState, owner: Instance | None, now: float) -> str:
-    """Return a phrase on how long the host of an instance has been silent; "" if it reports."""
+def _silence(state: MasterState, owner: Instance | None, now: float) -> float | None:
+    """Return the seconds for which the host of an instance has been silent; None: it reports."""
     if owner is None or state.hosts.condition_of(owner.host) in _REPORTING:
-        return ""
-    age = now - float(state.hosts.last_contact[owner.host.column])
-    return f"{owner.host.name} has been silent for {age:.0f} s"
+        return None
+    return now - float(state.hosts.last_contact[owner.host.column])
 
 
 def _stopped_by_slave(state: MasterState, owner: Instance, stop: StopPolicy, reason: str) -> str:
@@ -225,6 +225,8 @@ def _replicas(state: MasterState, process: Process, now: float) -> list[Mapping[
 
 def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
     position = row.queue_position
+    if row.state == "unknown":
+        return row.reason
     if process.name in state.neighbours.separated:
         return state.neighbours.separated[process.name][0]
     if position and (awaited := awaited_neighbour(state, process)):

@@ -290,6 +290,17 @@ def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
     assert ("read_log", "alpha") not in client.asked
 
 
+def test_a_log_that_is_nowhere_within_reach_is_not_called_missing(rosrm, client, slaves):
+    """The process may have run on the host that is away."""
+    client.hosts = [host("beta", "left")]
+    client.processes = [process("talker", "queued", host="")]
+    client.events = [event(1, host="beta")]
+    result = rosrm("logs", "talker")
+    assert result.code == 1
+    assert "no log of talker is within reach: beta has left: no slave runs there" in result.err
+    assert "has no log" not in result.err
+
+
 def test_older_parts_out_of_reach_are_reported(rosrm, client, slaves):
     client.hosts = [host("alpha"), host("beta", "lost")]
     client.events = [event(1, host="beta"), event(2, host="alpha")]

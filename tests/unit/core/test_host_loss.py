@@ -410,6 +410,8 @@ def test_rows_of_a_silent_host_are_stale() -> None:
     assert not listing.host_rows(cluster.state, cluster.now)[0].accepting
     (row,) = listing.process_rows(cluster.state, cluster.now)
     assert row.reason == "a has been silent for 4 s; last known: running"
+    assert row.since == pytest.approx(4.0, abs=0.5)
+    assert cluster.explain("p")["reason"] == row.reason
     cluster.wait(10.0)
     assert rows() == ("unreachable", True, "lost", {True})
     cluster.reconnect("a", seconds=1.0)
