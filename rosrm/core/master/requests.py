@@ -424,7 +424,7 @@ def host_state_requested(
     done = kind.removeprefix("host_")
     state.record(now, kind, f"{host.name} is {done}", host=host.name, by=event.by)
     reconsider_set_aside(state, now)
-    details = f": {departures(state, host)}" if host.draining else ""
+    details = f": {departures(state, host, now)}" if host.draining else ""
     state.emit(Reply(event.request, message=f"{host.name} is {done}{details}"))
 
 

@@ -235,7 +235,7 @@ def test_a_host_is_drained_when_all_movable_processes_have_left() -> None:
     cluster.set_host("b", "cordon")
     cluster.set_host("a", "drain")
     cluster.wait(3.0)
-    assert "no host has room for p" in cluster.recorded("nothing_moves")[0]
+    assert "no host can take p: b is cordoned" in cluster.recorded("nothing_moves")[0]
     cluster.machines["a"].connected = False
     cluster.set_host("b", "uncordon")
     cluster.wait(12.0)
@@ -244,6 +244,20 @@ def test_a_host_is_drained_when_all_movable_processes_have_left() -> None:
     assert (cluster.where("p"), len(cluster.recorded("host_drained"))) == (["b"], 1)
     cluster.set_host("a", "uncordon")
     assert not listing.host_rows(cluster.state, cluster.now)[0].drained
+
+
+def test_the_answer_to_a_drain_says_what_cannot_leave_yet() -> None:
+    """A host that is full, closed or silent may change, so these processes wait to leave."""
+    cluster = on_a({"p": 50, "q": 50}, machine("b"))
+    cluster.set_host("b", "drain")
+    said = cluster.set_host("a", "drain").message
+    each = "no host can take p: b is being drained; no host can take q: b is being drained"
+    assert said == f"a is draining: 2 processes cannot leave yet: {each}"
+    cluster.cut("a", seconds=20.0)
+    cluster.set_host("b", "uncordon")
+    unreachable = "each of p and q is unreachable; only a running process can be moved"
+    said = cluster.set_host("a", "drain").message
+    assert said == f"a is draining: 2 processes cannot leave yet: {unreachable}"
 
 
 def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> None:

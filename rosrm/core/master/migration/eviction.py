@@ -36,7 +36,7 @@ from rosrm.core.master.migration.start import (
 )
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.scheduling.decision import decide, verdict_of
-from rosrm.core.master.scheduling.feasibility import may_ever_take
+from rosrm.core.master.scheduling.feasibility import may_ever_take, why_each_closed
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -44,7 +44,7 @@ from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Instance, Process
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
-from rosrm.wording import counted, few, listed
+from rosrm.wording import by_reason, counted, few, listed
 
 #: Shortest time, in seconds, between two `nothing_moves` records of a host with different reasons.
 _RECORD_PERIOD: Final = 10.0
@@ -302,7 +302,9 @@ def _destination(
             if _is_alone(state, source):
                 return Rejected(_ALONE)
             why = _and_neighbours(ranking.demand) + _and_why(state, process, source)
-            return Rejected(f"no host has room for {process.name}{why}")
+            closed = _why_closed(state, source)
+            text = f"no host can take {process.name}: {closed}" if closed else ""
+            return Rejected((text or f"no host has room for {process.name}") + why)
         return state.hosts.hosts[column]
     if host is source:
         return Rejected(f"{process.name} runs on {host.name} already")
@@ -314,6 +316,13 @@ def _destination(
 
 def _is_alone(state: MasterState, source: Host) -> bool:
     return all(host is source for host in state.hosts.listed())
+
+
+def _why_closed(state: MasterState, source: Host) -> str:
+    """Return why each other host takes no process at all; "": one of them may."""
+    others = [host.column for host in state.hosts.listed() if host is not source]
+    refusals = why_each_closed(state.hosts, others)
+    return by_reason(refusals) if len(refusals) == len(others) else ""
 
 
 def _and_why(state: MasterState, process: Process, source: Host) -> str:
@@ -335,14 +344,32 @@ def _and_neighbours(demand: Demand) -> str:
 # --- drain ------------------------------------------------------------------------------------
 
 
-def departures(state: MasterState, host: Host) -> str:
-    """Return a phrase on the processes that leave a draining host, and those that cannot."""
-    leaving, staying = _leaving(state, host), _staying(state, host)
-    if not leaving:
+def departures(state: MasterState, host: Host, now: float) -> str:
+    """Return phrases on the processes that leave a draining host, that wait for it, and cannot."""
+    names, staying = _leaving(state, host), _staying(state, host)
+    if not names:
         return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
-    count = counted(len(leaving), "process leaves", "processes leave")
-    summary = f"{count} ({listed(leaving)})"
-    return f"{summary}; cannot leave: {'; '.join(few(staying))}" if staying else summary
+    waits = {name: why for name in names if (why := _why_not_yet(state, name, now))}
+    leaving = [name for name in names if name not in waits]
+    phrases = []
+    if leaving:
+        count = counted(len(leaving), "process leaves", "processes leave")
+        phrases.append(f"{count} ({listed(leaving)})")
+    if waits:
+        count = counted(len(waits), "process cannot leave yet", "processes cannot leave yet")
+        phrases.append(f"{count}: {'; '.join(few(_grouped(waits.items())))}")
+    if staying:
+        phrases.append(f"cannot leave: {'; '.join(few(staying))}")
+    return "; ".join(phrases)
+
+
+def _why_not_yet(state: MasterState, name: str, now: float) -> str:
+    """Return why a process that will leave its host does not move now; "": it moves, or ends."""
+    process = state.processes[name]
+    if name in state.migrations or process.wanted is not DesiredState.RUN:
+        return ""
+    planned = plan_moves(state, process, "", now)
+    return planned.reason if isinstance(planned, Rejected) else ""
 
 
 def _leaving(state: MasterState, host: Host) -> list[str]:
@@ -406,7 +433,7 @@ def _note_drained(state: MasterState, host: Host, now: float) -> None:
     host.drained = all(_why_it_stays(state, one) for one in held)
     if host.drained and not before:
         state.record(
-            now, EventKind.HOST_DRAINED, f"{host.name} is drained: {departures(state, host)}",
+            now, EventKind.HOST_DRAINED, f"{host.name} is drained: {departures(state, host, now)}",
             host=host.name,
         )  # fmt: skip
 
