@@ -67,7 +67,7 @@ def test_a_host_that_lacks_a_cpu_takes_no_process_that_requires_it(cluster) -> N
     """The reason names the CPU and those that the host has."""
     cluster.submit(service("pinned", cpus=(4000,)))
     row = cluster.wait("pinned", "set_aside")
-    assert "it has no CPU 4000; it has 0" in row.reason
+    assert "has no CPU 4000; it has 0" in row.reason
     cluster.cancel("pinned")
 
 
@@ -100,7 +100,7 @@ def test_a_slave_that_can_enforce_nothing_says_so_once(
     cluster = make_cluster(host("a"), liveness=STEADY)
     assert cluster.log_of("a").count("not enforced here: limits.memory") == 1
     cluster.submit(service("strict", limits=Limits(memory=200 * MB, enforce="required")))
-    reason = "it cannot enforce limits.memory: "
+    reason = "cannot enforce limits.memory: "
     assert reason in cluster.wait("strict", "set_aside").reason
     cluster.cancel("strict")
     assert cluster.run(job("lax", "true", limits=Limits(memory=200 * MB)))[0].state == "finished"
