@@ -101,8 +101,12 @@ def by_reason(reasons: Iterable[tuple[str, str]]) -> str:
 def _of_all(names: Sequence[str], reason: str) -> str:
     if not reason.startswith("it "):
         return f"{listed(names, most=3)}: {reason}"
-    subject = names[0] if len(names) == 1 else f"each of {listed(names, most=3)}"
-    return f"{subject} {reason.removeprefix('it ')}"
+    return f"{each_of(names, most=3)} {reason.removeprefix('it ')}"
+
+
+def each_of(names: Sequence[str], most: int = 8) -> str:
+    """Return names as the subject of one predicate: "a", "each of a and b"."""
+    return names[0] if len(names) == 1 else f"each of {listed(names, most=most)}"
 
 
 def first_line(reason: str) -> str:

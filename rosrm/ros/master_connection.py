@@ -163,10 +163,11 @@ def _greet(endpoints: Endpoints, name: str, timeout: float, begun: float) -> srv
     hello = find_master(endpoints, f"client {name}", timeout)
     settings = endpoints.participant.settings
     if hello is None:
+        security, advice = _about_security(endpoints)
         raise NoMaster(
             f"no master answered within {time.monotonic() - begun:.1f} s ({settings.describe()}, "
-            f"namespace {settings.namespace}, {_about_security(endpoints)[0]}). "
-            f"{_to_check(settings)} {_about_security(endpoints)[1]}"
+            f"namespace {settings.namespace}, {security}). "
+            f"{_to_check(settings)} {advice}"
         )
     if not hello.accepted:
         raise Refused(hello.message, "version")

@@ -44,7 +44,7 @@ from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Instance, Process
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState
-from rosrm.wording import by_reason, counted, few, listed
+from rosrm.wording import by_reason, counted, each_of, few, listed
 
 #: Shortest time, in seconds, between two `nothing_moves` records of a host with different reasons.
 _RECORD_PERIOD: Final = 10.0
@@ -395,10 +395,7 @@ def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
     for name, reason in dict.fromkeys(reasons):
         predicate = reason.removeprefix(f"{name} ")
         names[predicate, predicate != reason].append(name)
-    return [
-        f"{alike[0] if len(alike) == 1 else f'each of {listed(alike)}'} {text}" if named else text
-        for (text, named), alike in names.items()
-    ]
+    return [f"{each_of(alike)} {text}" if named else text for (text, named), alike in names.items()]
 
 
 def _why_it_stays(state: MasterState, instance: Instance) -> str:
