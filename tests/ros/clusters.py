@@ -57,7 +57,8 @@ def python(name: str, code: str, **options) -> ProcessSpec:
     return ProcessSpec(name, command=(sys.executable, "-ISc", code), kind=kind, **options)
 
 
-#: Last lines of a program with a node: however its context ends, the program ends with success.
+#: Last lines of a program with a node. A signal or a shutdown of the context raises an exception
+#: whose class depends on the moment; the program ends with success after each of them.
 SPIN = """
 try:
     rclpy.spin(node)

@@ -274,7 +274,7 @@ NETWORK = ScoringLink("network", Network(NetworkOptions()), 0.5, ("talks_to",))
 
 
 def test_only_what_reads_flows_is_asked_again_about_a_process_with_flows() -> None:
-    """Of a chain, the other policies score all hosts once for processes with equal needs."""
+    """The other policies of a chain score all hosts once for processes with equal needs."""
     asked = Asked()
     rate = {"a": 100.0, **{f"h{number}": 10.0 for number in range(20)}}
     cluster = Cluster(*map(machine, rate), chain=(ScoringLink("asked", asked), NETWORK))

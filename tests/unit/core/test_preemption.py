@@ -329,7 +329,7 @@ def test_a_claim_stands_while_the_master_assigns_no_work() -> None:
 
 
 def test_a_claim_stands_while_its_host_is_silent_for_a_moment() -> None:
-    """Its processes leave later, and not in vain."""
+    """Its processes leave later, and the process that waited is placed there."""
     cluster = claimed()
     cluster.cut("a", seconds=4.0)
     cluster.reconnect("a", seconds=2.0)

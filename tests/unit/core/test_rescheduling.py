@@ -183,7 +183,7 @@ def test_a_restart_of_a_waiting_process_tries_the_hosts_again_on_which_it_failed
 
 
 def test_a_restart_of_a_waiting_process_ends_its_delay() -> None:
-    """It is placed at once."""
+    """The process is placed at once."""
     cluster = Cluster("a").with_processes(failing(delay=60.0))
     cluster.finish("p", code=3)
     assert cluster.restart("p").accepted

@@ -251,7 +251,7 @@ def test_an_unlimited_niceness_is_not_missing(tmp_path: Path, monkeypatch) -> No
 
 
 def test_the_next_supervisor_knows_the_kills_of_earlier_runs(files) -> None:
-    """Those before the run are not reported again; those of the run are, whoever watched it."""
+    """It reports no kill from before the run, and each kill during the run."""
     before, group = files
     (group / "memory.events").write_text("oom_kill 2\n")
     before.make(KEY, LimitRule(), realtime=False)

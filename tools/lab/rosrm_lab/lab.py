@@ -95,7 +95,7 @@ class Lab:
                     record = LabRecord(plan, boot=boot_id(), owner=owner)
                     store.write(record)
                 making.make(self._hierarchies, record, between)
-            except BaseException:
+            except BaseException:  # a signal raises one, too, and no part of the lab may stay
                 _to_the_end(lambda: making.remove(self._hierarchies, self.name))
                 raise
 
@@ -246,7 +246,7 @@ class Lab:
         with process:
             try:
                 out, err = process.communicate((input or "").encode() or None, timeout)
-            except BaseException:
+            except BaseException:  # the program must not outlive a signal to this one
                 process.kill()
                 raise
         said, troubles = out.decode(errors="replace"), err.decode(errors="replace")
@@ -373,7 +373,7 @@ def _to_the_end(remove: Callable[[], object]) -> None:
     """Remove a lab completely; a signal's exception is raised again when nothing is left."""
     try:
         remove()
-    except BaseException:
+    except BaseException:  # such as KeyboardInterrupt by the signal
         remove()
         raise
 
