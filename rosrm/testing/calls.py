@@ -10,7 +10,7 @@ from unittest import SkipTest
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Problems, parse
-from rosrm.errors import ConfigError, PluginError
+from rosrm.errors import ConfigError, PluginError, place_in_plugin
 from rosrm.extensions.discovery import HOOKS, ChosenOffer, Offer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.made import FailedProbe
@@ -47,16 +47,14 @@ def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
         return late
 
     try:
-        answer = limited(seconds, ask, expired)
+        return limited(seconds, ask, expired)
     except Exception as fault:
         if late:
-            raise ContractBroken(late) from fault
+            place = place_in_plugin(fault)
+            raise ContractBroken(f"{late}, at {place}" if place else late) from fault
         if isinstance(fault, PluginError):
             raise ContractBroken(f"{hook}: {fault}") from None
         raise
-    if late:  # the plugin caught the exception
-        raise ContractBroken(late)
-    return answer
 
 
 def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str, Any]:
