@@ -21,7 +21,6 @@ from rosrm.core.master.scheduling.filters import (
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BoolArray
 from rosrm.core.master.state.hosts import HostCondition, HostTable
-from rosrm.model.values import ProcessSpec
 from rosrm.wording import by_reason, counted, first_line, get_close_matches, listed
 
 #: Largest number of hosts that a reason names.
@@ -30,7 +29,6 @@ _NAMED_HOSTS: Final = 16
 _PERMANENT: Final = tuple(one for one in FILTERS if one.lasts is Lasts.PERMANENT)
 _AWAY: Final = tuple(one for one in FILTERS if one.lasts is Lasts.AWAY)
 _ABSENT: Final = tuple(one for one in FILTERS if one.lasts in (Lasts.AWAY, Lasts.RETURN))
-_CLOSED: Final = tuple(one for one in FILTERS if one.name in ("gone", "expected", "cordon"))
 _LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
 
 
@@ -78,12 +76,14 @@ def why_all_away(table: HostTable, demand: Demand) -> str:
     return f"every host is away: {_host_by_host(_ABSENT, table, demand)}"
 
 
-def why_each_closed(table: HostTable, columns: Sequence[int]) -> list[tuple[str, str]]:
-    """Return the name of each of these hosts that is away or takes no work, and why."""
-    hosts = as_if_empty(table, Demand(ProcessSpec(""), {}), np.array(columns, np.int64))
-    found = refusals(_CLOSED, hosts)
+def why_each_never(
+    table: HostTable, demand: Demand, columns: Sequence[int]
+) -> list[tuple[str, str]]:
+    """Return the name of each of these hosts that may never take a demand, and why."""
+    hosts = as_if_empty(table, demand, np.array(columns, np.int64))
+    found = refusals(_PERMANENT, hosts)
     return [
-        (hosts.host(row).name, refusal.reason)
+        (hosts.host(row).name, first_line(refusal.reason))
         for row, refusal in enumerate(found)
         if refusal is not None
     ]
