@@ -203,7 +203,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
         return required(strategy.spec_fault(spec), str)
 
     try:
-        return state.plugins.ask("migration", name, "spec_fault", fault_of)
+        return state.plugins.ask("migration", name, "spec_fault", fault_of, strategy)
     except PluginError as error:
         return f"its check of this process failed: {error}"
 

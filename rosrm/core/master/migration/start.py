@@ -228,7 +228,7 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
         return checked(plan, "plan")  # the plan is written to the journal
 
     try:
-        return state.plugins.ask("migration", name, _HOOKS[aim], ask)
+        return state.plugins.ask("migration", name, _HOOKS[aim], ask, state.strategies[name])
     except PluginError as fault:
         return _no_plan(name, str(fault))
 

@@ -83,7 +83,9 @@ class Part:
         ask = self.scores.veto_reason if veto else self.scores.reason
         hook = "veto_reason" if veto else "reason"
         try:
-            return self.plugins.ask("scoring", self.link.name, hook, lambda: str(ask(at)))
+            return self.plugins.ask(
+                "scoring", self.link.name, hook, lambda: required(ask(at), str), self.scores
+            )
         except PluginError as error:
             return f"(no reason, because the policy failed: {error})"
 
@@ -274,7 +276,8 @@ def _scores_of(link: ScoringLink, hosts: Candidates) -> Scores | None:
     views = host_view(hosts), process_view(hosts, link.reads)
     try:
         return hosts.demand.plugins.calls.ask(
-            "scoring", link.name, "score", lambda: required(link.policy.score(*views), Scores)
-        )
+            "scoring", link.name, "score", lambda: required(link.policy.score(*views), Scores),
+            link.policy,
+        )  # fmt: skip
     except PluginError:
         return None  # the decision itself does not need the reasons
