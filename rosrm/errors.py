@@ -9,7 +9,7 @@ from types import FrameType
 from typing import Final
 
 #: Packages that load and call plugins; their frames are never frames of a plugin.
-_LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
+_LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy", "typer", "click"})
 
 
 class RosrmError(Exception):

@@ -193,7 +193,7 @@ def test_a_move_is_refused_with_its_reason() -> None:
     cluster = two_hosts()
     cluster.submit(process("fixed"), process("waits", memory=1e6))
     cases = [
-        (("x",), "no such process: 'x'; there are: waits, fixed, p "),
+        (("x",), "no such process: 'x'; there are: p, fixed, waits "),
         (("p", "z"), "no such host: 'z'; there are: a, b"),
         (("p", "a"), "p runs on a already"),
         (("fixed",), "has no migration strategy"),
@@ -448,6 +448,19 @@ def test_a_strategy_that_raises_or_proposes_an_unsound_plan_moves_nothing(
     assert fault.removeprefix("gave no plan: ") in message
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_duration_as_text_in_a_plan_is_named_with_its_path() -> None:
+    """The refusal names the field and the place of `propose`, and no comparison of types."""
+
+    def propose(move: Move) -> Plan:
+        plan = StartFirstOrStopFirst().propose(move)
+        wait = Execute("sleepy.wait", move.source_host, {}, "5s")  # type: ignore[arg-type]
+        return replace(plan, steps=(wait, *plan.steps))
+
+    message = moving_by(propose).migrate("p").message
+    assert "an unsound plan: steps[0].timeout" in message
+    assert f"({__file__}:{propose.__code__.co_firstlineno})" in message
 
 
 def test_a_strategy_that_cannot_move_a_process_does_not_fail() -> None:

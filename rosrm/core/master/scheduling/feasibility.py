@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -21,6 +21,7 @@ from rosrm.core.master.scheduling.filters import (
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import BoolArray
 from rosrm.core.master.state.hosts import HostCondition, HostTable
+from rosrm.model.values import ProcessSpec
 from rosrm.wording import by_reason, counted, first_line, get_close_matches, listed
 
 #: Largest number of hosts that a reason names.
@@ -122,14 +123,23 @@ def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -
     return f"{summary}; and {counted(more, 'more host')}" if more else summary
 
 
+def unknown_resources(table: HostTable, specs: Iterable[ProcessSpec]) -> list[str]:
+    """Return a sentence on each needed resource that no host reports; [] without any host."""
+    needed = {name for spec in specs for name in spec.needs}
+    return [_unknown(name, table) for name in sorted(needed - set(table.resources)) if len(table)]
+
+
 def _unmeasured(table: HostTable, demand: Demand) -> str:
     """Return a sentence on a resource that no host reports, with a near name; "": none."""
-    for resource in sorted(demand.declared - set(table.resources)):
-        near = get_close_matches(resource, table.resources, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        there = ", ".join(sorted(table.resources)) or "none"
-        return f"no host reports the resource {resource!r}{hint} (reported: {there})"
-    return ""
+    unknown = sorted(demand.declared - set(table.resources))
+    return _unknown(unknown[0], table) if unknown else ""
+
+
+def _unknown(resource: str, table: HostTable) -> str:
+    near = get_close_matches(resource, table.resources, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    there = ", ".join(sorted(table.resources)) or "none"
+    return f"no host reports the resource {resource!r}{hint} (reported: {there})"
 
 
 def _unknown_device(table: HostTable, demand: Demand) -> str:
