@@ -134,7 +134,7 @@ def place_in_plugin(fault: BaseException) -> str:
     return _innermost_of_plugin(_frames(fault))
 
 
-def place_in_stack(frame: FrameType | None, guard: FrameType) -> str:
+def place_in_stack(frame: FrameType | None, guard: FrameType | None) -> str:
     """Return file and line of the plugin's own innermost frame, of a running call; "": none.
 
     Args:

@@ -154,7 +154,7 @@ class Client:
 
     # --- listings ------------------------------------------------------------------------
 
-    def list(
+    def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0,

@@ -172,9 +172,7 @@ def wait_for_migration(
     changes = _Changes(on_change)
 
     def look(on_wait: OnWait | None = None) -> WaitResult:
-        view = master.list(
-            processes=True, events=True, process=name, after=after, on_wait=on_wait
-        )
+        view = master.list(processes=True, events=True, process=name, after=after, on_wait=on_wait)
         for event in view.events:
             if event.kind in _ENDINGS:
                 return WaitResult(_ENDINGS[event.kind], event=event, message=event.message)

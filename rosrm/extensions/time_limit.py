@@ -7,6 +7,7 @@ the `except` clause. Then the exception leaves the loop.
 
 from __future__ import annotations
 
+import inspect
 import logging
 import signal
 import sys
@@ -43,7 +44,7 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
-    alarm = _Alarm(sys._getframe())
+    alarm = _Alarm(inspect.currentframe())
     # A process has one timer, so that of a test runner or of an outer limit is restored afterwards.
     before = signal.signal(signal.SIGALRM, alarm.ring)
     left, interval = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
@@ -78,7 +79,7 @@ class _Alarm:
         interrupt: the newest interrupt; None if the call ended in time.
     """
 
-    def __init__(self, guard: FrameType) -> None:
+    def __init__(self, guard: FrameType | None) -> None:
         self.interrupt: _Interrupt | None = None
         self._guard = guard
         self._running = True

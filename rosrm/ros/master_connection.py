@@ -306,7 +306,7 @@ class MasterClient:
 
     # --- listings and logs ---------------------------------------------------------------
 
-    def list(
+    def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0, on_wait: OnWait | None = None,
@@ -479,9 +479,7 @@ class MasterClient:
         """
         check_bounds(request)
         deadline = time.monotonic() + max(self._timeout, patience)
-        answers = _ask_until_answered(
-            self._participant, client, request, deadline, _AGAIN, on_wait
-        )
+        answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN, on_wait)
         response = answers.answer
         acts = hasattr(request, "envelope")  # read-only requests have none
         if response is None:

@@ -129,7 +129,8 @@ def test_a_silence_of_the_master_is_noted_after_two_seconds(client, master, note
     """Followed events and waits need not fail first; each silence is noted once, with its end."""
     master.waits = (0.5, 2.1, 2.2, 9.0)
     next(client.events(follow=True))
-    assert notes == ["the master has not answered for 2 s; still waiting", "the master answers again"]
+    silence = "the master has not answered for 2 s; still waiting"
+    assert notes == [silence, "the master answers again"]
 
 
 def test_a_wait_says_why_it_is_not_done(client, master):

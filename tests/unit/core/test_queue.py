@@ -94,9 +94,8 @@ def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> Non
     """The process is set aside, because a host that reports the resource may still register."""
     cluster = Cluster("a", "b")
     reply = cluster.submit(process("p", needs={"memroy": 1e6}))
-    fault = (
-        "no host reports the resource 'memroy'; did you mean 'memory'? (reported: cpu, memory)"
-    )
+    fault = "no host reports the resource 'memroy'; did you mean 'memory'? "
+    fault += "(reported: cpu, memory)"
     assert cluster["p"].reason == f"no host may take it: {fault}"
     assert reply.message == f"1 process queued. Warning: {fault}"
 

@@ -175,7 +175,9 @@ def _order(
         return checked(step, "step")
 
     try:
-        step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask, strategy)
+        step = state.plugins.ask(
+            "migration", spec.migration.strategy or "", "periodic", ask, strategy
+        )
     except PluginError as error:
         _record_trouble(state, dumped, str(error), now)
         return
