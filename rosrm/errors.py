@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-from traceback import walk_tb
+from collections.abc import Iterable
+from itertools import takewhile
+from traceback import walk_stack, walk_tb
+from types import FrameType
 from typing import Final
 
 #: Packages that load and call plugins; their frames are never frames of a plugin.
-_LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy"})
+_LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy", "typer", "click"})
 
 
 class RosrmError(Exception):
@@ -117,7 +120,7 @@ def describe_plugin_fault(fault: BaseException) -> str:
     """
     if isinstance(fault, PluginError):
         return str(fault)
-    place = _place_in_plugin(fault)
+    place = place_in_plugin(fault)
     return describe_fault(fault) + (f" ({place})" if place else "")
 
 
@@ -126,24 +129,43 @@ def place_in_rosrm(fault: BaseException) -> str:
     return _innermost(_frames(fault), "rosrm")
 
 
-def _place_in_plugin(fault: BaseException) -> str:
-    """Return file and line of the plugin's own innermost frame; "" if rosrm raised the fault.
+def place_in_plugin(fault: BaseException) -> str:
+    """Return file and line of the plugin's own innermost frame; "" if rosrm raised the fault."""
+    return _innermost_of_plugin(_frames(fault))
+
+
+def place_in_stack(frame: FrameType | None, guard: FrameType | None) -> str:
+    """Return file and line of the plugin's own innermost frame, of a running call; "": none.
+
+    Args:
+        frame: the innermost frame of the call.
+        guard: the frame of rosrm that executes the call.
+    """
+    called = takewhile(lambda one: one[0] is not guard, walk_stack(frame)) if frame else ()
+    return _innermost_of_plugin(_packages(called)[::-1])
+
+
+def _innermost_of_plugin(frames: list[tuple[str, str]]) -> str:
+    """Return the place of the plugin's own innermost frame.
 
     The plugin may call libraries, so the package of the first frame outside rosrm is the plugin's.
     """
-    frames = _frames(fault)
     own = next((package for package, _ in frames if package not in _LOADERS), "")
     return _innermost(frames, own) if own else ""
 
 
 def _frames(fault: BaseException) -> list[tuple[str, str]]:
     """Return top-level package and place of each frame of a traceback, the innermost last."""
+    return _packages(walk_tb(fault.__traceback__))
+
+
+def _packages(frames: Iterable[tuple[FrameType, int]]) -> list[tuple[str, str]]:
     return [
         (
             str(frame.f_globals.get("__name__", "?")).partition(".")[0],
             f"{frame.f_code.co_filename}:{line}",
         )
-        for frame, line in walk_tb(fault.__traceback__)
+        for frame, line in frames
     ]
 
 

@@ -11,7 +11,7 @@ from typing import Final
 _SIZES: Final = ("B", "kB", "MB", "GB", "TB", "PB")
 _BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
 #: Highest number of names with which a misspelt name is compared, because the master's loop waits.
-_MOST_COMPARED: Final = 1000
+MOST_COMPARED: Final = 1000
 #: Commands that list the names of a kind.
 _LISTED_BY: Final = {"process": "rosrm ps --all", "host": "rosrm hosts"}
 _STANDING: Final = {
@@ -49,9 +49,9 @@ def no_such(kind: str, names: Sequence[str], known: Iterable[str]) -> str:
     Args:
         kind: "process" or "host".
         names: unknown names.
-        known: known names of that kind, the likeliest first.
+        known: known names of that kind; those after the first `MOST_COMPARED` are not compared.
     """
-    there = list(islice(known, _MOST_COMPARED))
+    there = list(islice(known, MOST_COMPARED))
     most = 3 if len(names) == 1 else 1
     near = [repr(one) for name in names[:3] for one in get_close_matches(name, there, most)]
     if near:

@@ -38,8 +38,9 @@ DISTRIBUTIONS: Final = {"criu": "rosrm-criu", "lab": "rosrm-lab", "simulate": "r
 _UNCUT: Final = 1000
 #: Duplicate marks of repetition, as in "WORK......" and "[NAME...]...".
 _DOTS_TWICE: Final = re.compile(r"(\.\.\.\]?)\.\.\.")
-#: Base class of all errors of a command line, which typer does not export.
+#: Base classes of all errors of a command line, which typer does not export.
 _UsageError: Final = cast(type[Any], BadParameter.__mro__[1])
+CommandLineError: Final = cast(type[Exception], BadParameter.__mro__[2])
 _BRACES: Final = str.maketrans("", "", "{}")
 
 

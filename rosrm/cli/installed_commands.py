@@ -6,16 +6,25 @@ the commands. To stay quick, rosrm's own commands do neither.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import errno
+import os
+import sys
+import traceback
+from collections.abc import Container, Sequence
+from contextlib import redirect_stdout
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, Final
 
 import typer
 
-from rosrm.cli.groups import PlainCommand, add_command
-from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.cli.groups import CommandLineError, PlainCommand, add_command
+from rosrm.errors import PluginError, RosrmError, describe_plugin_fault
 from rosrm.extensions.installed import COMMANDS, PluginAddress, installed_plugins
+from rosrm.model.rows import PluginRow
 from rosrm.wording import listed
+
+#: Errors of writing the output, which the entry point of the command reports.
+_OF_OUTPUT: Final = (errno.EPIPE, errno.ENOSPC)
 
 
 def find_commands() -> dict[str, list[PluginAddress]]:
@@ -39,13 +48,48 @@ def load_command(name: str, addresses: Sequence[PluginAddress]) -> Any:
     (address,) = addresses
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
     try:
-        add_command(alone, name, resolve_name(address.target))
-        return typer.main.get_group(alone).commands[name]
+        with redirect_stdout(sys.stderr):  # `rosrm COMMAND --json` prints nothing else
+            add_command(alone, name, resolve_name(address.target))
+        return _guarded(typer.main.get_group(alone).commands[name], address)
     except (Exception, SystemExit) as fault:  # noqa: BLE001 - code of another distribution
         reason = describe_plugin_fault(fault)
     return _unusable(
         name, f"the command {name!r} of {address.distribution} cannot be loaded: {reason}"
     )
+
+
+def ignored_commands(own: Container[str]) -> list[PluginRow]:
+    """Return a row for each command of another distribution with the name of one of rosrm's own."""
+    reason = "its command is ignored, because rosrm has one of this name: rename its entry point"
+    return [
+        PluginRow("plugin", address.name, address.distribution, "broken", reason)
+        for name, addresses in find_commands().items()
+        if name in own
+        for address in addresses
+    ]
+
+
+def _guarded(command: Any, address: PluginAddress) -> Any:
+    """Return a command whose exceptions become an error with the distribution and the place."""
+    invoke = command.invoke
+
+    def guarded(ctx: Any) -> Any:
+        try:
+            return invoke(ctx)
+        except (RosrmError, typer.Exit, typer.Abort, CommandLineError):
+            raise
+        except Exception as fault:
+            if isinstance(fault, OSError) and fault.errno in _OF_OUTPUT:
+                raise
+            if os.environ.get("ROSRM_TRACEBACK"):
+                traceback.print_exc()
+            raise PluginError(
+                f"the command {address.name!r} of {address.distribution} failed: "
+                f"{describe_plugin_fault(fault)}; ROSRM_TRACEBACK=1 shows the whole traceback"
+            ) from fault
+
+    command.invoke = guarded
+    return command
 
 
 def _unusable(name: str, reason: str) -> Any:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
@@ -154,10 +154,11 @@ class Client:
 
     # --- listings ------------------------------------------------------------------------
 
-    def list(
+    def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
         host: str = "", after: int = 0, newest: int = 0,
+        on_wait: Callable[[float], None] | None = None,
     ) -> Listing:  # fmt: skip
         """Return the requested listings; one request reads all of them.
 
@@ -170,10 +171,12 @@ class Client:
             host: limit events to this host; "": all.
             after: limit events to those after this sequence.
             newest: most events; 0: 1000.
+            on_wait: called about every 0.1 s while the master does not answer, with the seconds
+                since the request; an exception that it raises ends the request.
         """
         return self._master.list(
             hosts=hosts, processes=processes, plugins=plugins, events=events, process=process,
-            host=host, after=after, newest=newest,
+            host=host, after=after, newest=newest, on_wait=on_wait,
         )  # fmt: skip
 
     def list_processes(self) -> Sequence[ProcessRow]:

@@ -307,6 +307,8 @@ def _why_away(row: HostRow | None, host: str) -> str:
         return ""
     if row.state == "left":
         return f"{host} has left: no slave runs there"
+    if row.state == "expected":
+        return f"{host} has not reported since the master started"
     silent = duration(row.reading_age)
     if row.state == "detached":
         return f"{host} is detached: its slave was stopped {silent} ago"

@@ -16,6 +16,8 @@ Notify = Callable[[str], None]
 
 #: Seconds between two requests.
 PERIOD: Final = 0.5
+#: Seconds without an answer after which a message says so; a busy master may need one second.
+_SILENCE: Final = 2.0
 
 
 def deadline_after(timeout: float | None) -> float:
@@ -23,27 +25,36 @@ def deadline_after(timeout: float | None) -> float:
     return math.inf if timeout is None else time.monotonic() + timeout
 
 
-def ask_until_answered(look: Callable[[], T], notify: Notify, deadline: float = math.inf) -> T:
-    """Return the master's answer, retrying until the deadline; notify once if it is silent.
+def ask_until_answered(look: Callable[..., T], notify: Notify, deadline: float = math.inf) -> T:
+    """Return the master's answer, retrying until the deadline; notify if it is silent.
 
     Args:
-        look: asks the master; raises `NoMaster` after some seconds without an answer.
-        notify: takes a message when the silence begins, and one when it ends.
+        look: asks the master; raises `NoMaster` after some seconds without an answer. Its argument
+            `on_wait` takes the seconds of a wait, repeatedly.
+        notify: takes a message when the silence begins, one with the places to check, and one when
+            the silence ends.
         deadline: monotonic seconds after which the silence is an error.
 
     Raises:
         NoMaster: the master was silent at the deadline.
     """
-    silent = False
+    silent = failed = False
+
+    def on_wait(seconds: float) -> None:
+        nonlocal silent
+        if seconds >= _SILENCE and not silent and time.monotonic() < deadline:
+            silent = True
+            notify(f"the master has not answered for {seconds:.0f} s; still waiting")
+
     while True:
         try:
-            answer = look()
+            answer = look(on_wait=on_wait)
         except NoMaster as error:
             if time.monotonic() >= deadline:
                 raise
-            if not silent:
+            if not failed:
                 notify(f"{error} Asking again until the master answers")
-            silent = True
+            silent = failed = True
             time.sleep(PERIOD)
         else:
             if silent:

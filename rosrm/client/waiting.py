@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
@@ -13,7 +14,7 @@ from rosrm.model.rows import EventRow, ProcessRow
 from rosrm.wording import standing
 
 if TYPE_CHECKING:
-    from rosrm.ros.master_connection import MasterClient
+    from rosrm.ros.master_connection import MasterClient, OnWait
 
 #: Seconds for which a process is set aside before it counts as waiting for a host that may never
 #: come: just after the start of a cluster its hosts are still registering.
@@ -98,7 +99,7 @@ def wait_for_processes(
     changes = _Changes(on_change)
     verdicts: dict[str, _Verdict] = {}
     while True:
-        view = ask_until_answered(lambda: master.list(processes=True), notify, deadline)
+        view = ask_until_answered(partial(master.list, processes=True), notify, deadline)
         rows = {row.name: row for row in view.processes}
         ours = [rows[name] for name in names if name in rows]
         verdicts.update((row.name, _judge(row, until, before)) for row in ours)
@@ -170,8 +171,8 @@ def wait_for_migration(
     """
     changes = _Changes(on_change)
 
-    def look() -> WaitResult:
-        view = master.list(processes=True, events=True, process=name, after=after)
+    def look(on_wait: OnWait | None = None) -> WaitResult:
+        view = master.list(processes=True, events=True, process=name, after=after, on_wait=on_wait)
         for event in view.events:
             if event.kind in _ENDINGS:
                 return WaitResult(_ENDINGS[event.kind], event=event, message=event.message)
@@ -193,8 +194,10 @@ def wait_for_drain(
     The arguments are those of `wait_for_migration`.
     """
 
-    def look() -> WaitResult:
-        view = master.list(hosts=True, processes=True, events=True, host=host, after=after)
+    def look(on_wait: OnWait | None = None) -> WaitResult:
+        view = master.list(
+            hosts=True, processes=True, events=True, host=host, after=after, on_wait=on_wait
+        )
         row = next((row for row in view.hosts if row.description.name == host), None)
         staying = [row for row in view.processes if row.host == host and row.state not in ENDED]
         if row is not None and row.drained:
@@ -210,7 +213,7 @@ def wait_for_drain(
 
 
 def _look_until(
-    look: Callable[[], WaitResult], timeout: float | None, notify: Notify
+    look: Callable[..., WaitResult], timeout: float | None, notify: Notify
 ) -> WaitResult:
     """Return the first result of `look` without pending names, or the last one in time."""
     deadline = deadline_after(timeout)

@@ -85,10 +85,8 @@ class PluginCheck:
     def _options(self, title: str, wanted: type[Any], given: Node) -> Mapping[str, Any]:
         try:
             value = validated(wanted, given, self._problems, title)
-            if value is None:
-                return {}
             self._check_names(wanted, given, title)
-            return dict(to_plain(value))
+            return {} if value is None else dict(to_plain(value))
         except Exception as fault:  # noqa: BLE001 - the annotations are a plugin's, not ours
             self._problems.add(given.place, f"{title} cannot be checked: {fault}")
             return {}

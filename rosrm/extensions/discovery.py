@@ -6,8 +6,11 @@ its distribution and with name and place of the hook, and does not affect other 
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import logging
+import re
+import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
@@ -57,6 +60,11 @@ SLOW_LOADING: Final = 5.0
 #: Time-out of the import of a plugin, and of each of its hooks; seconds.
 LOADING_LIMIT: Final = 30.0
 
+#: Names of offers, which are written in files and shown in tables.
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
+_NAME_FORM: Final = (
+    'at most 64 letters, digits, "_", "-" and ".", the first of them a letter or digit'
+)
 #: Exceptions of a faulty plugin; a plugin that calls `sys.exit` must not end the master.
 FAULTS: Final = (Exception, SystemExit)
 
@@ -145,7 +153,9 @@ def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
     timer.start()
     late = f"it did not return within {LOADING_LIMIT:g} s; move slow work into `create`"
     try:
-        return limited(LOADING_LIMIT, call, lambda: late)
+        # What the code prints must not mix with the output of a command, such as JSON.
+        with contextlib.redirect_stdout(sys.stderr):
+            return limited(LOADING_LIMIT, call, lambda: late)
     finally:
         timer.cancel()
 
@@ -217,6 +227,8 @@ def _call(hook: str, function: Callable[..., Any]) -> Any:
     """Call one hook through pluggy, which checks the arguments; other plugins are not involved."""
     alone = pluggy.PluginManager(GROUP)
     alone.add_hookspecs(hookspecs)
+    if parameters := inspect.signature(function).parameters:
+        raise TypeError(f"it has the parameters {', '.join(parameters)}; a hook has none")
     alone.register(SimpleNamespace(**{hook: function}))
     answers = getattr(alone.hook, hook)()
     return answers[0] if answers else None  # pluggy omits an answer of None
@@ -229,6 +241,8 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     name: object = getattr(offer, "name", None)
     if not isinstance(name, str) or not name.strip():
         return f"offers something without a name: {name!r}"
+    if not _NAME.fullmatch(name):
+        return f"offers the name {name!r}; allowed: {_NAME_FORM}"
     if not callable(getattr(offer, "create", None)):
         return f"{name!r}: `create` cannot be called"
     if isinstance(offer, LauncherOffer):

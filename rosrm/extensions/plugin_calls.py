@@ -7,8 +7,8 @@ selected  a call raises, is late, or answers in       `failing`; a record
           breach of the contract
 failing   a call fails with another error             a record, at most one in
                                                       `RECORD_PERIOD` seconds
-failing   a call succeeds, and none has failed for    `selected`; a record
-          `WORKS_AFTER` seconds
+failing   a call has succeeded since the last         `selected`; a record
+          failure, `WORKS_AFTER` seconds ago
 ========  ==========================================  =====================================
 """
 
@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from inspect import getattr_static
+from inspect import getattr_static, unwrap
 from math import inf
+from types import CodeType, MemberDescriptorType
 from typing import Any, Final, TypeGuard, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.model.rows import PluginKind
-from rosrm.wording import counted
+from rosrm.wording import counted, duration
 
 T = TypeVar("T")
 #: Kind and name of an offer.
@@ -55,26 +56,30 @@ class Failing:
         error: last failure: the hook, the exception and its place.
         count: number of failures since the plugin worked last.
         last: time of the last failure.
+        succeeded: True if a call has succeeded since.
     """
 
     error: str = ""
     count: int = 0
     last: float = -inf
+    succeeded: bool = False
     _recorded: str = ""
     _recorded_at: float = -inf
 
     def note(self, error: str, count: int, now: float) -> bool:
         """Note the newest error; return True if it must be recorded."""
         self.error, self.count, self.last = error, self.count + count, now
+        self.succeeded = False
         if error == self._recorded or now - self._recorded_at < RECORD_PERIOD:
             return False
         self._recorded, self._recorded_at = error, now
         return True
 
-    @property
-    def reason(self) -> str:
-        """Return the last error and the number of failures, for a listing."""
-        return f"{self.error}; {counted(self.count, 'failure')} so far"
+    def reason(self, now: float) -> str:
+        """Return the last error, its age and the number of failures, for a listing."""
+        since = "; it has succeeded since" if self.succeeded else ""
+        age = duration(now - self.last)
+        return f"{self.error}; {counted(self.count, 'failure')} so far, the last {age} ago{since}"
 
 
 def _without_limit(_plugin: Plugin, call: Callable[[], Any]) -> Any:
@@ -95,7 +100,9 @@ class PluginCalls:
     _failed: dict[Plugin, Failing] = field(default_factory=dict)
     _worked: set[Plugin] = field(default_factory=set)
 
-    def ask(self, kind: PluginKind, name: str, hook: str, call: Callable[[], T]) -> T:
+    def ask(
+        self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], of: object = None
+    ) -> T:
         """Return the answer of a plugin.
 
         Args:
@@ -103,13 +110,21 @@ class PluginCalls:
             name: name of the offer.
             hook: name of the called method, for messages.
             call: calls the method and checks the answer; raises `PluginError` for an invalid one.
+            of: object with the method; its place is added to the text about an invalid answer.
 
         Raises:
             PluginError: the call failed; the text has the error and its place.
         """
         plugin = (kind, name)
+
+        def placed() -> T:
+            try:
+                return call()
+            except PluginError as fault:
+                raise PluginError(with_place(fault, of, hook)) from None
+
         try:
-            answer: T = self.limit(plugin, call)
+            answer: T = self.limit(plugin, placed)
         except KeyboardInterrupt:  # Ctrl-C of a simulation; a master handles the signal itself
             raise
         except BaseException as fault:  # a plugin may raise anything, even SystemExit
@@ -127,8 +142,10 @@ class PluginCalls:
         for plugin, noted in self._failed.items():
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
                 found.append((plugin, noted.error))
-        for plugin in sorted(self._worked - self._failed.keys()):
-            if now - self.failing[plugin].last >= WORKS_AFTER:
+        for plugin in self._worked - self._failed.keys():
+            self.failing[plugin].succeeded = True
+        for plugin, known in sorted(self.failing.items()):
+            if known.succeeded and now - known.last >= WORKS_AFTER:
                 del self.failing[plugin]
                 found.append((plugin, ""))
         self._failed.clear()
@@ -153,6 +170,31 @@ def required(answer: object, kind: type[T]) -> T:
     if not isinstance(answer, kind):
         raise PluginError(f"answered {given(answer)}; {kind.__name__} is required")
     return answer
+
+
+def with_place(fault: PluginError, owner: object, method: str) -> str:
+    """Return the text about an invalid answer, with the place of the plugin's method."""
+    place = _place_of(owner, method)
+    return f"{fault} ({place})" if place else str(fault)
+
+
+def _place_of(owner: object, name: str) -> str:
+    """Return file and line of the definition of a method or property; "": rosrm's, or unknown.
+
+    No code of the plugin runs, and no file is read.
+    """
+    found = getattr_static(owner, name, None)
+    if isinstance(found, MemberDescriptorType):
+        found = found.__get__(owner)
+    if isinstance(found, property):
+        found = found.fget
+    if isinstance(found, staticmethod | classmethod):
+        found = found.__func__
+    function: Any = unwrap(found) if callable(found) else found
+    code = getattr(function, "__code__", None)
+    if not isinstance(code, CodeType) or str(function.__module__).partition(".")[0] == "rosrm":
+        return ""
+    return f"{code.co_filename}:{code.co_firstlineno}"
 
 
 def given(answer: object) -> str:

@@ -447,8 +447,10 @@ class Registry:
             if len(same) == 1:
                 self._offers[key] = offered
             else:
-                sources = " and ".join(str(other.source) for other in same)
-                reason = f"offered twice, by {sources}: uninstall one"
+                sources = list(dict.fromkeys(str(other.source) for other in same))
+                reason = f"offered by {' and '.join(sources)}: uninstall all but one"
+                if len(sources) == 1:
+                    reason = f"offered {len(same)} times by {sources[0]}: rename all but one"
                 self._broken.append(Broken(offered.source, reason, *key))
 
     def _refuse_shared_executors(self) -> None:

@@ -1,19 +1,37 @@
-"""Time-out of a plugin call, by the real-time interval timer of the process."""
+"""Time-out of a plugin call, by the real-time interval timer of the process.
+
+An alarm raises an exception in the plugin. A plugin may catch it in a loop. So from the second
+alarm on, a trace function raises the exception again at the next line of each function, which is in
+the `except` clause. Then the exception leaves the loop.
+"""
 
 from __future__ import annotations
 
+import inspect
+import logging
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable
 from types import FrameType
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
+
+from rosrm.errors import place_in_stack
 
 T = TypeVar("T")
 
 #: Time-out of a call of a policy or strategy by the master, in seconds.
 CALL_LIMIT: Final = 1.0
-#: Seconds between two alarms, because a plugin may catch the first one.
+#: Seconds from the first alarm to the second one, because a plugin may catch the first one.
 _AGAIN: Final = 0.05
+#: Seconds between the further alarms. The trace function gets through one `try` of each function;
+#: with several around each other, some alarm must come between them.
+_SOON: Final = 0.001
+#: Seconds between two log lines on a call that does not end.
+_LOG_PERIOD: Final = 5.0
+
+_log = logging.getLogger("rosrm.plugins")
 
 
 def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T:
@@ -22,24 +40,103 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
     A loop inside C code that never returns to Python cannot be interrupted.
 
     Raises:
-        TimeoutError: the call took too long; the text is that of `late`.
+        TimeoutError: the call took too long, even if it returned; the text is that of `late`.
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
-    running = True
-
-    def expired(_signal: int, _frame: FrameType | None) -> None:
-        if running:  # otherwise the call ended at the last moment
-            raise TimeoutError(late())
-
+    alarm = _Alarm(inspect.currentframe())
     # A process has one timer, so that of a test runner or of an outer limit is restored afterwards.
-    before = signal.signal(signal.SIGALRM, expired)
+    before = signal.signal(signal.SIGALRM, alarm.ring)
     left, interval = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
     try:
         return call()
     finally:
-        running = False
+        alarm.stop()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         if left:
             signal.signal(signal.SIGALRM, before)
             signal.setitimer(signal.ITIMER_REAL, left, interval)
+        if alarm.interrupt is not None:
+            # The traceback has the place in the plugin at which the call was interrupted.
+            raise TimeoutError(late()).with_traceback(alarm.interrupt.__traceback__) from None
+
+
+def _is_own(frame: FrameType | None) -> bool:
+    return frame is not None and frame.f_code.co_filename == __file__
+
+
+class _Interrupt(BaseException):
+    """Interrupt of an overdue call; no `Exception`, because plugins catch these."""
+
+
+class _Alarm:
+    """The interrupts of one call.
+
+    Args:
+        guard: the frame that executes the call; it is not interrupted itself.
+
+    Attributes:
+        interrupt: the newest interrupt; None if the call ended in time.
+    """
+
+    def __init__(self, guard: FrameType | None) -> None:
+        self.interrupt: _Interrupt | None = None
+        self._guard = guard
+        self._running = True
+        self._rung_at = self._logged_at = 0.0
+        self._before = (sys.gettrace(), sys.getprofile())
+
+    def stop(self) -> None:
+        """Interrupt nothing from now on."""
+        self._running = False
+        if self.interrupt is not None:
+            sys.settrace(self._before[0])
+            sys.setprofile(self._before[1])
+
+    def ring(self, _signal: int, frame: FrameType | None) -> None:
+        """Interrupt the call: handle the signal of the timer."""
+        if not self._running or _is_own(frame):  # the call ended at the last moment
+            return
+        sys.settrace(None)
+        sys.setprofile(None)
+        if self.interrupt is not None:  # the plugin caught it
+            self._log_place(frame)
+            self._trace_from(frame)
+            signal.setitimer(signal.ITIMER_REAL, _SOON, _SOON)
+        self._rung_at = self._rung_at or time.monotonic()
+        raise self._next_interrupt()
+
+    def _next_interrupt(self) -> _Interrupt:
+        self.interrupt = _Interrupt("a plugin was interrupted, because its call took too long")
+        return self.interrupt
+
+    def _log_place(self, frame: FrameType | None) -> None:
+        now = time.monotonic()
+        if now - self._logged_at < _LOG_PERIOD:
+            return
+        self._logged_at = now
+        _log.warning(
+            "a plugin catches its interrupt, and has not returned %.1f s after its time limit; "
+            "it is interrupted again at %s",
+            now - self._rung_at, place_in_stack(frame, self._guard) or "an unknown place",
+        )  # fmt: skip
+
+    def _trace_from(self, frame: FrameType | None) -> None:
+        """Interrupt the call at the next line of this frame, of a callee, or of its callers."""
+        sys.settrace(self._trace)
+        # Python ends the tracing when the trace function raises, and a caller may catch that, too.
+        sys.setprofile(self._profile)
+        while frame is not None and frame is not self._guard:
+            frame.f_trace = self._trace
+            frame = frame.f_back
+
+    def _trace(self, frame: FrameType, event: str, _argument: Any) -> Any:
+        if not self._running or _is_own(frame):
+            return None
+        if event == "line":
+            raise self._next_interrupt()
+        return self._trace
+
+    def _profile(self, frame: FrameType, event: str, _argument: Any) -> None:
+        if event == "return" and self._running:
+            self._trace_from(frame.f_back)

@@ -88,9 +88,9 @@ class MasterQueries:
         return rows + [row for host in self._state.hosts.hosts for row in _failing_rows(host)]
 
     def _own_plugins(self) -> list[PluginRow]:
-        failing = self._state.plugins.failing
+        failing, now = self._state.plugins.failing, self._core_now()
         return [
-            replace(row, state="failing", reason=known.reason)
+            replace(row, state="failing", reason=known.reason(now))
             if (known := failing.get((row.kind, row.name))) is not None
             else row
             for row in self._plugins

@@ -50,8 +50,8 @@ class HostRow:
     """One host.
 
     Attributes:
-        state: "up", "suspect", "lost", "left" or "detached" (its slave was stopped and left
-            processes running).
+        state: "up", "suspect", "expected" (it has not reported since the master started), "lost",
+            "left" or "detached" (its slave was stopped and left processes running).
         accepting: the slave is under all its limits and has requested work.
         reading_age: seconds since the newest `resource_info`.
         drained: the host is draining, and no process that can leave is left on it.

@@ -47,6 +47,10 @@ _UNKNOWN_EPOCH: Final = 0
 _MASTER: Final = "the master"
 
 
+#: Takes the seconds for which a request has waited; an exception that it raises ends the wait.
+OnWait = Callable[[float], None]
+
+
 def _spin(participant: Participant, timeout: float) -> None:
     """Handle incoming messages for at most `timeout` seconds, and then the signals that arrived."""
     with signals_deferred():
@@ -128,14 +132,23 @@ def find_master(endpoints: Endpoints, who: str, timeout: float) -> srv.Handshake
 
 
 def _ask_until_answered(
-    participant: Participant, client: Any, request: Any, deadline: float, again: float
-) -> _Answers:
+    participant: Participant, client: Any, request: Any, deadline: float, again: float,
+    on_wait: OnWait | None = None,
+) -> _Answers:  # fmt: skip
     """Repeat a request until `deadline`; return the first answer.
+
+    `on_wait` is called about every 0.1 s with the seconds since the first request.
 
     A server sends no answer before it has discovered the client's reader, and a new client's
     request may arrive earlier.
     """
-    answers = _Answers()
+    answers, began = _Answers(), time.monotonic()
+
+    def answered() -> bool:
+        if not answers.first and on_wait is not None:
+            on_wait(time.monotonic() - began)
+        return bool(answers.first)
+
     while not answers.first:
         now = time.monotonic()
         if now >= deadline:
@@ -143,7 +156,7 @@ def _ask_until_answered(
         answers.sent += 1
         with signals_deferred():
             client.call_async(request).add_done_callback(participant.counted(answers.take))
-        wait_until(participant, lambda: bool(answers.first), min(deadline, now + again))
+        wait_until(participant, answered, min(deadline, now + again))
     return answers
 
 
@@ -293,21 +306,22 @@ class MasterClient:
 
     # --- listings and logs ---------------------------------------------------------------
 
-    def list(
+    def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
-        host: str = "", after: int = 0, newest: int = 0,
+        host: str = "", after: int = 0, newest: int = 0, on_wait: OnWait | None = None,
     ) -> Listing:  # fmt: skip
         """Return the requested listings; `plugins="failing"` limits plugins to failing ones.
 
-        The arguments after `events` narrow the events.
+        The arguments from `process` to `newest` narrow the events. `on_wait` is called about every
+        0.1 s while the master does not answer.
         """
         request = srv.List.Request(
             protocol_version=PROTOCOL_VERSION, hosts=hosts, processes=processes,
             plugins=bool(plugins), failing=plugins == "failing", events=events, process=process,
             host=host, after_sequence=after, max_events=newest,
         )  # fmt: skip
-        answer = self._call(srv.List, names.LIST, request)
+        answer = self._call(srv.List, names.LIST, request, on_wait=on_wait)
         return Listing(
             master=answer.master, uptime=answer.uptime, last_sequence=answer.last_sequence,
             trouble=answer.trouble, security=answer.security, strangers=answer.strangers,
@@ -439,11 +453,14 @@ class MasterClient:
         known.client.peer, known.until = slave, until
         return known
 
-    def _call(self, kind: Any, name: str, request: Any, patience: float = 0.0) -> Any:
+    def _call(
+        self, kind: Any, name: str, request: Any, patience: float = 0.0,
+        on_wait: OnWait | None = None,
+    ) -> Any:  # fmt: skip
         """Send a request to the master until it is answered."""
         client = self._client(kind, name)
         try:
-            return self._answered(client, kind, request, _MASTER, patience)
+            return self._answered(client, kind, request, _MASTER, patience, on_wait)
         except Refused as refusal:
             if refusal.code != "stale" or hasattr(request, "envelope"):
                 raise
@@ -452,8 +469,9 @@ class MasterClient:
             return self._answered(client, kind, request, _MASTER)
 
     def _answered(
-        self, client: SealedClient, kind: Any, request: Any, who: str, patience: float = 0.0
-    ) -> Any:
+        self, client: SealedClient, kind: Any, request: Any, who: str, patience: float = 0.0,
+        on_wait: OnWait | None = None,
+    ) -> Any:  # fmt: skip
         """Send a request until an answer comes; the receiver repeats a lost answer.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
@@ -461,7 +479,7 @@ class MasterClient:
         """
         check_bounds(request)
         deadline = time.monotonic() + max(self._timeout, patience)
-        answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN)
+        answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN, on_wait)
         response = answers.answer
         acts = hasattr(request, "envelope")  # read-only requests have none
         if response is None:

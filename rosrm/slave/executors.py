@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -15,6 +17,8 @@ from rosrm.extensions.discovery import definition
 from rosrm.extensions.made import OfferedExecutor
 from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
 from rosrm.ros.slave.services import ExecutorOutcome
+
+_log = logging.getLogger("rosrm.slave")
 
 #: Takes the outcome of an executor.
 Done = Callable[[ExecutorOutcome], None]
@@ -94,6 +98,8 @@ class Executors:
             done(outcome)
 
         def work() -> None:
+            # The last line of a slave that an executor ended, for example by `os._exit`.
+            _log.debug("the executor %s of %s begins (%s)", name, strategy, place)
             outcome = _outcome(name, function, complete)
             timer.cancel()
             self._post(partial(settle, outcome))
@@ -147,6 +153,8 @@ def _no_json(value: object, path: str) -> str:
     if isinstance(value, list | tuple):
         found = (_no_json(item, f"{path}[{index}]") for index, item in enumerate(value))
         return next(filter(None, found), "")
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"{path}: {value}"
     return "" if _is_plain(value) else f"{path}: {type(value).__name__}"
 
 

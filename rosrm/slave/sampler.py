@@ -35,6 +35,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.extensions.plugin_calls import with_place
 from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, MOST_USED, RESOURCE_SLOTS
 from rosrm.slave.probe_reads import UsageByProcess, read_devices, read_processes, read_values
@@ -394,9 +395,15 @@ class _Watched:
     def _read(self) -> None:
         started = self._clock()
         self._started = started
-        measured, reason = _guarded("read", self._measure)
-        devices, fault = _guarded("devices", lambda: read_devices(self._probe))
-        values, by_process = measured or ((), EMPTY)
+        values, reason = self._guarded("read", lambda: read_values(self._probe, self.names))
+        by_process: UsageByProcess | None = None
+        if values is not None:
+            by_process, reason = self._guarded(
+                "by_process", lambda: read_processes(self._probe, self._resources)
+            )
+        devices, fault = self._guarded("devices", lambda: read_devices(self._probe))
+        if by_process is None or values is None:
+            values, by_process = (), EMPTY
         ended = self._clock()
         self.outcome = _Outcome(
             values, by_process, devices, reason or fault, ended - started, ended - self.asked
@@ -404,16 +411,12 @@ class _Watched:
         self.busy = False
         self._progress.set()
 
-    def _measure(self) -> tuple[tuple[float, ...], UsageByProcess]:
-        return read_values(self._probe, self.names), read_processes(self._probe, self._resources)
-
-
-def _guarded(name: str, call: Callable[[], _T]) -> tuple[_T | None, str]:
-    """Return the result of a call of a plugin, or None and why it failed."""
-    try:
-        return call(), ""
-    except PluginError as nonsense:
-        return None, str(nonsense)
-    except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
-        # SystemExit, makes its readings stale and harms nothing else.
-        return None, f"{name}() raised {describe_plugin_fault(error)}"
+    def _guarded(self, name: str, call: Callable[[], _T]) -> tuple[_T | None, str]:
+        """Return the result of a call of the probe, or None and why it failed."""
+        try:
+            return call(), ""
+        except PluginError as nonsense:
+            return None, with_place(nonsense, self._probe, name)
+        except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
+            # SystemExit, makes its readings stale and harms nothing else.
+            return None, f"{name}() raised {describe_plugin_fault(error)}"

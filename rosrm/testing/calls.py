@@ -10,10 +10,11 @@ from unittest import SkipTest
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Problems, parse
-from rosrm.errors import ConfigError, PluginError
+from rosrm.errors import ConfigError, PluginError, place_in_plugin
 from rosrm.extensions.discovery import HOOKS, ChosenOffer, Offer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.made import FailedProbe
+from rosrm.extensions.plugin_calls import with_place
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import to_plain
@@ -28,13 +29,14 @@ class ContractBroken(AssertionError):
     """Violation of a contract by a plugin, with a description."""
 
 
-def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
+def call(hook: str, seconds: float, ask: Callable[[], T], of: object = None) -> T:
     """Return the answer of a plugin.
 
     Args:
         hook: name of the called hook, for messages.
         seconds: time limit of master or slave for this call.
         ask: calls the hook and checks the answer; raises `PluginError` for a wrong one.
+        of: the object with the hook, whose place the message about a wrong answer has.
 
     Raises:
         ContractBroken: the call exceeded its limit, or its answer is wrong.
@@ -47,16 +49,14 @@ def call(hook: str, seconds: float, ask: Callable[[], T]) -> T:
         return late
 
     try:
-        answer = limited(seconds, ask, expired)
+        return limited(seconds, ask, expired)
     except Exception as fault:
         if late:
-            raise ContractBroken(late) from fault
+            place = place_in_plugin(fault)
+            raise ContractBroken(f"{late}, at {place}" if place else late) from fault
         if isinstance(fault, PluginError):
-            raise ContractBroken(f"{hook}: {fault}") from None
+            raise ContractBroken(f"{hook}: {with_place(fault, of, hook)}") from None
         raise
-    if late:  # the plugin caught the exception
-        raise ContractBroken(late)
-    return answer
 
 
 def checked_options(wanted: type[Any], given: Mapping[str, Any]) -> Mapping[str, Any]:

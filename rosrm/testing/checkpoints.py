@@ -48,7 +48,7 @@ class CheckpointContract:
 
     def _choice(self, policy: CheckpointPolicy, view: CheckpointView) -> CheckpointChoice | None:
         """Return a choice, with the time limit and checks of the master."""
-        return call("choose", CALL_LIMIT, lambda: sound_choice(policy.choose(view), view))
+        return call("choose", CALL_LIMIT, lambda: sound_choice(policy.choose(view), view), policy)
 
     def views(self) -> Sequence[CheckpointView]:
         """Return views of a process: without a replica, with replicas, and on the only host."""
@@ -103,4 +103,4 @@ class CheckpointContract:
                     assert again == first, f"for the same view the pace was {first}, then {again}"
 
     def _pace(self, policy: MemoryPacing, view: MemoryView) -> float | None:
-        return call("pace", CALL_LIMIT, lambda: sound_pace(policy.pace(view)))
+        return call("pace", CALL_LIMIT, lambda: sound_pace(policy.pace(view)), policy)

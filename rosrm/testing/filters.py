@@ -46,7 +46,7 @@ class FilterContract:
     def _mask(self, one: PlacementFilter, hosts: HostView, process: ProcessView) -> BoolArray:
         """Return a copy of the mask, with the time limit and checks of the master."""
         count = len(hosts.names)
-        mask = call("mask", CALL_LIMIT, lambda: checked_mask(one.mask(hosts, process), count))
+        mask = call("mask", CALL_LIMIT, lambda: checked_mask(one.mask(hosts, process), count), one)
         return np.array(mask)
 
     def test_judges_every_host(self) -> None:
@@ -84,7 +84,7 @@ class FilterContract:
         for hosts, process in self.cases():
             for row in np.flatnonzero(~self._mask(one, hosts, process))[:20]:
                 ask = partial(one.reason, hosts, process, int(row))
-                reason = call("reason", CALL_LIMIT, partial(_text_of, ask))
+                reason = call("reason", CALL_LIMIT, partial(_text_of, ask), one)
                 assert reason, f"{hosts.names[row]} fails without a reason"
 
     def test_no_hosts(self) -> None:

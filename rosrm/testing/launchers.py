@@ -59,8 +59,12 @@ class LauncherContract:
 
     def _prepared(self, launcher: Launcher, launch: Launch) -> Launch | None:
         """Return what a launcher prepares; the limit and the check are those of the slave."""
-        prepared = call("prepare", PREPARE_LIMIT, partial(launcher.prepare, launch))
-        return None if prepared is None else required(prepared, Launch)
+
+        def ask() -> Launch | None:
+            prepared = launcher.prepare(launch)
+            return None if prepared is None else required(prepared, Launch)
+
+        return call("prepare", PREPARE_LIMIT, ask, launcher)
 
     def test_prepares_a_command_line_of_text(self) -> None:
         """The launcher returns a command line and an environment of text for the supervisor."""

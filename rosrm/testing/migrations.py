@@ -12,7 +12,14 @@ from math import inf
 from pathlib import Path
 from typing import Any, ClassVar, Final, get_type_hints
 
-from rosrm.extensions.contracts import Imaging, MigrationOffer, MigrationStrategy, PeriodicImaging
+from rosrm.extensions.contracts import (
+    Imaging,
+    MigrationOffer,
+    MigrationStrategy,
+    PeriodicImaging,
+    SpecChecking,
+)
+from rosrm.extensions.discovery import definition
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.extensions.time_limit import CALL_LIMIT
@@ -73,7 +80,7 @@ class MigrationContract:
         return strategy
 
     def _plan(self, strategy: MigrationStrategy, move: Move) -> Plan:
-        return _plan("propose", partial(strategy.propose, move))
+        return _plan("propose", partial(strategy.propose, move), strategy)
 
     def moves(self) -> Sequence[Move]:
         """Return one move of a process with `overlap: true`, and one with `overlap: false`."""
@@ -95,6 +102,15 @@ class MigrationContract:
         """Return a move with its options, as the master passes it."""
         return with_options(move, self.offer, **self.options)
 
+    def test_accepts_its_process(self) -> None:
+        """The check of a submitted process, if there is one, returns a text: "" for `spec`."""
+        strategy: object = self.make()
+        if not implements(strategy, SpecChecking):
+            return
+        ask = partial(strategy.spec_fault, self.spec)
+        fault = call("spec_fault", CALL_LIMIT, lambda: required(ask(), str), strategy)
+        assert not fault, f"spec_fault refuses the `spec` of the test class: {fault}"
+
     def test_plan_is_sound(self) -> None:
         """Each plan has one commit, uses only hosts of its move, and a time-out for every wait."""
         for move in self.moves():
@@ -115,10 +131,10 @@ class MigrationContract:
                 ("checkpoint", strategy.checkpoint, Aim.CHECKPOINT),
                 ("restore", strategy.restore, Aim.RESTORE),
             ):
-                plan = _plan(hook, partial(make, here))
+                plan = _plan(hook, partial(make, here), strategy)
                 fault = fault_of(plan, here, aim)
                 assert not fault, f"the plan of {hook} is unsound: {fault}"
-                again = _plan(hook, partial(make, here))
+                again = _plan(hook, partial(make, here), strategy)
                 assert again == plan, f"{hook} gave another plan for the same move"
                 assert checked(plan, "plan") == plan, f"the journal changes the plan of {hook}"
 
@@ -136,7 +152,7 @@ class MigrationContract:
 
         def periodic(now: int) -> Execute:
             step = partial(strategy.periodic, self.spec, instance, "a", now)
-            return call("periodic", CALL_LIMIT, lambda: required(step(), Execute))
+            return call("periodic", CALL_LIMIT, lambda: required(step(), Execute), strategy)
 
         first, again, later = periodic(1), periodic(1), periodic(2)
         assert first == again, "periodic gave another step for the same time"
@@ -287,7 +303,8 @@ class MigrationContract:
                     raise
                 except Exception:  # noqa: BLE001, S112 - an executor may fail its step by raising
                     continue
-                results[step.executor] = as_json(f"{who} answered", answer)
+                place = definition(self.offer.executors[step.executor])
+                results[step.executor] = as_json(f"{who} ({place}) answered", answer)
 
     def test_options_of_a_process_are_read_from_the_move(self) -> None:
         """The plan is the same if a work file gives the same quantities with units.
@@ -329,7 +346,7 @@ def before_commit(plan: Plan) -> Sequence[Step]:
     return list(takewhile(lambda step: not isinstance(step, Commit), plan.steps))
 
 
-def _plan(hook: str, ask: Callable[[], Plan]) -> Plan:
+def _plan(hook: str, ask: Callable[[], Plan], strategy: object) -> Plan:
     """Return a plan, with the time limit and checks of the master."""
 
     def sound() -> Plan:
@@ -337,4 +354,4 @@ def _plan(hook: str, ask: Callable[[], Plan]) -> Plan:
         checked(plan, "plan")
         return plan
 
-    return call(hook, CALL_LIMIT, sound)
+    return call(hook, CALL_LIMIT, sound, strategy)

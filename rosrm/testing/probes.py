@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.extensions.contracts import HostLabelling, Probe, ProbeContext, ProbeOffer
 from rosrm.extensions.made import MadeProbe, fault_of_labels, unmeasured
-from rosrm.extensions.plugin_calls import implements
+from rosrm.extensions.plugin_calls import implements, with_place
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.values import EMPTY, Reading, ResourceDescription
 from rosrm.slave.probe_reads import read_devices, read_processes, read_values
@@ -130,9 +131,9 @@ class ProbeContract:
     def _read(self, probe: Probe) -> None:
         """Read the probe as a slave does, within the deadline and with its checks."""
         names = tuple(resource.name for resource in probe.resources)
-        call("read", self.offer.deadline, lambda: read_values(probe, names))
+        call("read", self.offer.deadline, lambda: read_values(probe, names), probe)
         resources = tuple(probe.resources)
-        call("by_process", self.offer.deadline, lambda: read_processes(probe, resources))
+        call("by_process", self.offer.deadline, lambda: read_processes(probe, resources), probe)
 
     def test_resources_are_well_described(self) -> None:
         """Resources have valid types, unique names of the offer, and capacities above 0."""
@@ -190,11 +191,24 @@ class ProbeContract:
     def test_reads_in_another_thread(self) -> None:
         """A read works within its deadline in a thread that did not create the probe."""
         probe = self.make()
-        answers: list[list[Reading]] = []
-        thread = threading.Thread(target=lambda: answers.append(list(probe.read())), daemon=True)
+        names = tuple(resource.name for resource in probe.resources)
+        faults: list[str] = []
+
+        def read() -> None:
+            try:
+                read_values(probe, names)
+            except PluginError as wrong:
+                faults.append(with_place(wrong, probe, "read"))
+            except BaseException as fault:  # noqa: BLE001 - raised in the test by its text
+                faults.append(describe_plugin_fault(fault))
+            else:
+                faults.append("")
+
+        thread = threading.Thread(target=read, daemon=True)
         thread.start()
         thread.join(self.offer.deadline)
-        assert answers, f"no answer within its own deadline of {self.offer.deadline:g} s"
+        assert faults, f"no answer within its own deadline of {self.offer.deadline:g} s"
+        assert not faults[0], f"read fails in another thread: {faults[0]}"
         probe.close()
 
     def test_close_releases_files(self) -> None:

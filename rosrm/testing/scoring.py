@@ -214,7 +214,7 @@ class ScoringContract:
             checked_scores(scores, hosts, np.ones(len(hosts.names), np.bool_))
             return scores
 
-        return call("score", CALL_LIMIT, ask)
+        return call("score", CALL_LIMIT, ask, policy)
 
     def cases(self) -> Sequence[tuple[HostView, ProcessView]]:
         """Return hosts and processes of many kinds, as passed by the master."""
@@ -265,7 +265,7 @@ class ScoringContract:
 
     def _reason(self, scores: Scores, row: int, hook: str) -> str:
         ask = partial(getattr(scores, hook), row)
-        return call(hook, CALL_LIMIT, lambda: required(ask(), str))
+        return call(hook, CALL_LIMIT, lambda: required(ask(), str), scores)
 
     def test_no_hosts(self) -> None:
         """The policy accepts an empty list of hosts."""

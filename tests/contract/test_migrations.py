@@ -208,3 +208,38 @@ def test_a_strategy_that_reads_a_processs_options_as_text_is_caught():
     _sleepy(dict).test_options_of_a_process_are_read_from_the_move()
     with pytest.raises(ValueError, match=r"'2\.0s'"):
         _sleepy(dict, raw=True).test_options_of_a_process_are_read_from_the_move()
+
+
+class _Checking(_Sleepy):
+    """A strategy that checks a process with the given answer."""
+
+    def __init__(self, answer):
+        super().__init__()
+        self._answer = answer
+
+    def spec_fault(self, spec):
+        return self._answer
+
+
+@pytest.mark.parametrize(
+    ("answer", "why"),
+    [
+        (None, r"spec_fault: answered None; str is required \(.*test_migrations\.py:\d+\)"),
+        ("it has no camera", "refuses the `spec` of the test class: it has no camera"),
+    ],
+)
+def test_a_strategy_that_refuses_its_own_process_is_caught(answer, why):
+    """The check of a submitted process returns a text, and accepts the process of the contract."""
+    contract = MigrationContract()
+    contract.offer = MigrationOffer("checking", lambda options: _Checking(answer), _Options)
+    with pytest.raises(AssertionError, match=why):
+        contract.test_accepts_its_process()
+
+
+def test_the_place_of_a_method_with_a_wrong_answer_is_named():
+    """The failure has file and line of `propose`, because no exception shows them."""
+    contract = MigrationContract()
+    strategy = type("Strategy", (), {"propose": lambda self, move: None})
+    contract.offer = MigrationOffer("bad", lambda options: strategy())
+    with pytest.raises(AssertionError, match=r"answered None; Plan .*test_migrations\.py:\d+\)"):
+        contract.test_plan_is_sound()

@@ -123,3 +123,16 @@ def test_contract_catches(make, test):
     finally:
         while _LEAKED:
             _LEAKED.pop().close()
+
+
+def test_a_probe_without_an_answer_is_named_in_another_thread():
+    """A `read` that returns None in a thread is a wrong answer, not a late one."""
+    contract = ProbeContract()
+
+    class Silent(FakeProbe):
+        def read(self):
+            return None
+
+    contract.offer = ProbeOffer("bad", lambda options, context: Silent(a=0.1), resources=("a",))
+    with pytest.raises(AssertionError, match=r"answered None; a list of Readings .*\.py:\d+"):
+        contract.test_reads_in_another_thread()

@@ -105,3 +105,21 @@ def test_contract_catches(policy, test):
     contract.offer = ScoringOffer("bad", lambda options: policy())
     with pytest.raises(AssertionError):
         getattr(contract, test)()
+
+
+class _Unending:
+    def score(self, hosts, process):
+        while True:
+            try:  # noqa: SIM105 - as a careless plugin does
+                sum(range(1000))
+            except BaseException:  # noqa: BLE001
+                pass
+
+
+@pytest.mark.timeout(60)
+def test_a_policy_that_catches_its_interrupt_fails_the_contract_with_its_place():
+    """A loop that catches every exception ends, and the failure has the plugin's file and line."""
+    contract = ScoringContract()
+    contract.offer = ScoringOffer("bad", lambda options: _Unending())
+    with pytest.raises(AssertionError, match=r"score took longer than 1 s.*test_scoring\.py:\d+"):
+        contract.test_scores_every_host()

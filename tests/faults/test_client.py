@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
+import time
 from collections.abc import Sequence
 
 import pytest
@@ -75,6 +76,29 @@ def test_a_listing_and_a_log_are_read_across_restarts(make_cluster) -> None:
         cluster.restart_master()
         asking.join(PATIENCE)
     assert found == ["speaks"]
+
+
+def test_a_request_to_a_killed_master_reports_its_wait_and_can_be_ended(make_cluster) -> None:
+    """The caller learns every moment for how long it waits, and ends the request at once."""
+    cluster = make_cluster(host("h0"))
+
+    class Enough(Exception):
+        pass
+
+    def on_wait(seconds: float) -> None:
+        waits.append(seconds)
+        if seconds > 1.0:
+            raise Enough
+
+    waits: list[float] = []
+    with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
+        client.list()
+        cluster.master.process.kill()
+        began = time.monotonic()
+        with pytest.raises(Enough):
+            client.list(on_wait=on_wait)
+        assert time.monotonic() - began < 5.0
+    assert len(waits) > 5
 
 
 def _rows(client: MasterClient) -> Sequence[ProcessRow]:

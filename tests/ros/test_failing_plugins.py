@@ -39,7 +39,9 @@ def named(name, act):
 
 def raises(count): raise RuntimeError("the policy is out of order")
 def hangs(count):
-    while True: pass
+    while True:
+        try: sum(range(1000))
+        except BaseException: pass
 
 @hookimpl
 def register_scoring_policies():
@@ -225,7 +227,10 @@ def plugins(cluster) -> list:
     [("raises", "out of order"), ("hangs", "1 s"), ("exits", "SystemExit: 3")],
 )
 def test_a_policy_that_fails_is_left_out_and_named(make_cluster, third_party, policy, said) -> None:
-    """A process is placed without the failing policy, with an event; the master keeps running."""
+    """A process is placed without the failing policy, with an event; the master keeps running.
+
+    The policy that hangs also catches its interrupt.
+    """
     cluster = make_cluster(host("h0"), scoring=(ScoringChoice(policy),))
     cluster.submit(job("judged", "true"))
     event = cluster.wait_for_event("plugin_failed", says=f"'{policy}'")

@@ -78,8 +78,11 @@ def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
     wrong = []
     plugins: list[tuple[str, Callable[[], object]]] = [
         *(("scoring", partial(registry.scoring, o.policy, o.options)) for o in cluster.scoring),
-        ("filters", lambda: registry.filters(cluster.filters)),
-        ("migration", lambda: registry.migrations(cluster.migration.strategies)),
+        *(("filters", partial(registry.filters, {n: o})) for n, o in cluster.filters.items()),
+        *(
+            ("migration", partial(registry.migrations, {name: options}))
+            for name, options in cluster.migration.strategies.items()
+        ),
         (
             "checkpoint",
             lambda: registry.checkpoint(cluster.checkpoint.policy, cluster.checkpoint.options),

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -169,7 +170,7 @@ def top(
     order = top_screen.sort_of(sort)
     with connection.master(ctx, domain) as client:
         top_screen.show(
-            lambda: client.list(hosts=True, processes=True, events=True, newest=4),
+            partial(client.list, hosts=True, processes=True, events=True, newest=4),
             seconds, count, order,
         )  # fmt: skip
 

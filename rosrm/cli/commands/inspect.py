@@ -95,11 +95,13 @@ def plugins(
 
     A plugin is selected, available, absent on a host, broken, or failing, and the reason is shown.
     """
+    from rosrm.cli.installed_commands import ignored_commands
     from rosrm.cli.output import json_forms, tables
     from rosrm.extensions.registry import Registry
 
     if local:
-        rows = list(Registry.discover().rows())
+        own = ctx.find_root().command
+        rows = [*Registry.discover().rows(), *ignored_commands(getattr(own, "commands", ()))]
     else:
         with connection.master(ctx, domain) as client:
             rows = list(client.list_plugins())

@@ -41,6 +41,7 @@ STYLES: Final = {
     "migrating": "cyan",
     "checkpointed": "cyan",
     "suspect": "yellow",
+    "expected": "yellow",
     "detached": "yellow",
     "absent": "yellow",
     "failed": "red",

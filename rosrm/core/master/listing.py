@@ -26,7 +26,7 @@ _CONDITION: Final = {
     HostCondition.SUSPECT: "suspect",
     HostCondition.LOST: "lost",
     HostCondition.LEFT: "left",
-    HostCondition.EXPECTED: "lost",
+    HostCondition.EXPECTED: "expected",
     HostCondition.DETACHED: "detached",
 }
 #: Conditions in which a host reports; a host that leaves reports until its instances have ended.

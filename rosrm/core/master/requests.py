@@ -23,6 +23,7 @@ from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
 from rosrm.core.master.rescheduling import forget_failures
 from rosrm.core.master.rights import check_rights
+from rosrm.core.master.scheduling.feasibility import unknown_resources
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -34,7 +35,7 @@ from rosrm.model.limits import limits_fault
 from rosrm.model.orders import RestartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import ProcessSpec
-from rosrm.wording import counted, listed, no_such
+from rosrm.wording import MOST_COMPARED, counted, listed, no_such
 
 #: Kind of the record of each action on a host.
 _HOST_EVENTS: Final = {
@@ -71,7 +72,8 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     nodes = {process.node for process in processes}
     users = [one for one in state.processes.values() if one.node in nodes]
     live = [one for one in users if not one.phase.is_terminal]
-    shared = shared_nodes((one.name, one.node) for one in [*processes, *live])
+    doubts = shared_nodes((one.name, one.node) for one in [*processes, *live])
+    doubts += unknown_resources(state.hosts, specs)
     for process in processes:
         state.next_order += 1
         state.add_process(process)
@@ -79,7 +81,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         message = f"{process.name} was submitted"
         state.record(now, EventKind.SUBMITTED, message, process=process.name, by=event.by)
         state.save(process)
-    warnings = "".join(f". Warning: {one}" for one in shared)
+    warnings = "".join(f". Warning: {one}" for one in doubts)
     state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
 
 
@@ -203,7 +205,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
         return required(strategy.spec_fault(spec), str)
 
     try:
-        return state.plugins.ask("migration", name, "spec_fault", fault_of)
+        return state.plugins.ask("migration", name, "spec_fault", fault_of, strategy)
     except PluginError as error:
         return f"its check of this process failed: {error}"
 
@@ -220,7 +222,8 @@ def known_processes(state: MasterState, names: Iterable[str], by: Requester) -> 
     """Return the processes of these names; refuse unknown names, and processes of others."""
     unknown = [name for name in names if name not in state.processes]
     if unknown:
-        raise RequestRefused(no_such("process", unknown, reversed(state.processes)), "unknown")
+        newest = list(state.processes)[-MOST_COMPARED:]
+        raise RequestRefused(no_such("process", unknown, newest), "unknown")
     processes = [state.processes[name] for name in dict.fromkeys(names)]
     check_rights(processes, by)
     return processes

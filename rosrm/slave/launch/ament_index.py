@@ -18,6 +18,8 @@ from rosrm.wording import get_close_matches, listed
 _PACKAGES = "share/ament_index/resource_index/packages"
 #: Most names that are listed if none is similar.
 _FEW: Final = 8
+#: Least similarity of a suggested name: `tracetools` has 0.67 to `image_tools`.
+_SIMILAR: Final = 0.7
 
 
 def search_path(environment: Mapping[str, str], python: str) -> list[Path]:
@@ -71,7 +73,7 @@ def _near(name: str, known: Sequence[str]) -> str:
     """Return a hint with similar names or the existing ones; "" if there are no names."""
     if not known:
         return ""
-    close = get_close_matches(name, known, n=3, cutoff=0.5)
+    close = get_close_matches(name, known, n=3, cutoff=_SIMILAR)
     close = close or [other for other in known if name in other][:3]
     if close:
         return f"; did you mean {listed(close, 'or')}?"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Final, TypeVar
 
-from rosrm.errors import LaunchError, RosrmError, describe_plugin_fault
+from rosrm.errors import LaunchError, PluginError, RosrmError, describe_plugin_fault
 from rosrm.extensions.contracts import (
     Capabilities,
     GraphDepartureLauncher,
@@ -18,7 +18,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.discovery import FAULTS
 from rosrm.extensions.made import MadeLauncher, MadeLaunchers
-from rosrm.extensions.plugin_calls import implements, required
+from rosrm.extensions.plugin_calls import implements, required, with_place
 from rosrm.extensions.time_limit import limited
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 
@@ -94,6 +94,9 @@ class Launchers:
         try:
             prepared = limited(PREPARE_LIMIT, call, lambda: late)
             return None if prepared is None else required(prepared, Launch)
+        except PluginError as wrong:
+            text = with_place(wrong, self.made[name].launcher, "prepare")
+            raise LaunchError(f"the launcher {name!r} fails: prepare: {text}") from None
         except (RosrmError, ValueError) as error:
             if isinstance(error, LaunchError):
                 raise

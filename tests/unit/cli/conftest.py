@@ -85,6 +85,7 @@ class FakeClient:
     strangers: str = ""
     asked: list = field(default_factory=list)
     fails: BaseException | None = None
+    waits: tuple = ()  # seconds without an answer, before each listing
     settings: object = None
     closed: bool = False
 
@@ -133,7 +134,10 @@ class FakeClient:
         return STORY
 
     def list(self, *, hosts=False, processes=False, plugins=False, events=False, process="",
-             host="", after=0, newest=0):  # fmt: skip
+             host="", after=0, newest=0, on_wait=None):  # fmt: skip
+        if on_wait is not None:
+            for seconds in self.waits:
+                on_wait(seconds)
         self._note("list", {"process": process, "host": host, "after": after, "newest": newest})
         chosen = [row for row in self.events if row.sequence > after]
         chosen = [one for one in chosen if process in ("", one.process) and host in ("", one.host)]

@@ -159,13 +159,15 @@ def fails(*_):
 def test_plugins_that_cannot_be_made_are_found(check, install):
     """The check makes all plugins of a cluster; errors name their place in the file."""
     misspelt = MigrationOffer("m", lambda options: SimpleNamespace(proposes=1))
-    install(ScoringOffer("s", fails), CheckpointOffer("c", lambda options: None), misspelt)
-    text = "scoring: {policy: s}\nmigration: {strategies: [m]}\ncheckpoint: {policy: c}\n"
+    second = MigrationOffer("n", lambda options: SimpleNamespace(purposes=1))
+    install(ScoringOffer("s", fails), CheckpointOffer("c", lambda options: None), misspelt, second)
+    text = "scoring: {policy: s}\nmigration: {strategies: [m, n]}\ncheckpoint: {policy: c}\n"
     result = check(text)
     assert result.code == 2
     assert "f.yaml: scoring: scoring policy 's' of plugin 'ours': `create` (" in result.err
     assert "raised KeyError: 'bus'" in result.err
     assert "which has no `propose`; is its `proposes` misspelt?" in result.err
+    assert "is its `purposes` misspelt?" in result.err
     assert "made None; an object with `choose` is required" in result.err
     assert "test_config_check.py:" in result.err
 

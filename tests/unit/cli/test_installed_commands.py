@@ -27,6 +27,10 @@ def saw(times: int) -> None:
     """Saw some wood."""
     print("saw " * times)
 
+def spoil() -> None:
+    """Fail."""
+    raise KeyError("salt")
+
 number = 7
 '''
 
@@ -94,6 +98,31 @@ def test_a_command_of_rosrm_cannot_be_replaced(rosrm, installed):
 
     assert rosrm("config", "check", "--help").code == 0
     assert rosrm("--help").out.count("\n  config ") == 1
+
+
+def test_a_command_with_the_name_of_one_of_rosrm_is_listed_as_broken(rosrm, installed):
+    """The listing of local plugins says why the command is ignored."""
+    installed("acme", "ps = acme_commands:hello")
+
+    rows = [line for line in rosrm("plugins", "--local").out.splitlines() if "acme" in line]
+    assert len(rows) == 1
+    assert "its command is ignored, because rosrm has one of this name" in rows[0]
+
+
+@pytest.mark.parametrize("traceback", [False, True])
+def test_an_exception_of_a_command_is_one_sentence_with_its_place(
+    rosrm, installed, monkeypatch, traceback
+):
+    """The sentence names distribution, error, file and line; a variable shows the traceback."""
+    installed("acme", "spoil = acme_commands:spoil")
+    monkeypatch.setenv("ROSRM_TRACEBACK", "1" if traceback else "")
+
+    result = rosrm("spoil")
+
+    assert result.code == 1
+    assert "rosrm: the command 'spoil' of acme 1.5 failed: KeyError: 'salt' (" in result.err
+    assert "acme_commands.py:" in result.err
+    assert ("Traceback" in result.err) == traceback
 
 
 def test_two_distributions_with_one_command_are_both_named(rosrm, installed):

@@ -6,8 +6,9 @@ from io import StringIO
 
 import pytest
 from rich.console import Console
+from rich.live import Live
 
-from rosrm.cli.output import top
+from rosrm.cli.output import top, top_screen
 from rosrm.model.rows import Listing
 from tests.unit.core.cluster import Cluster
 from tests.unit.core.cluster import process as core_process
@@ -173,3 +174,56 @@ def test_what_matters_comes_first_and_the_queue_keeps_its_order():
     order = ["lost", "works", "first", "second", "new", "old"]
     names = [line.split(" ")[0] for line in lines_of(*rows, hosts=[])]
     assert [name for name in names if name in order] == order
+
+
+class _Keys:
+    """Keys that a user presses, one for each time that the view waits for one."""
+
+    def __init__(self, *keys):
+        self.keys = list(keys)
+
+    def __call__(self, seconds):
+        return self.keys.pop(0) if self.keys else ""
+
+
+def _live(*keys):
+    """Return a live view into text, and the text."""
+    output = StringIO()
+    console = Console(file=output, width=100, color_system=None, force_terminal=True)
+    screen = Live(console=console, auto_refresh=False)
+    snapshot = Listing("lab", 1.0, 0, HOSTS, PROCESSES)
+    return top_screen._LiveView(screen, _Keys(*keys), snapshot, "state"), screen, output
+
+
+def test_a_silent_master_is_shown_while_its_answer_is_awaited(monkeypatch):
+    """After 1 s the view says for how long the master has not answered, until it answers."""
+    view, screen, output = _live()
+    seen = []
+
+    def look(on_wait):
+        for seconds in (0.5, 1.5):
+            on_wait(seconds)
+            seen.append(output.getvalue())
+        return Listing("lab", 2.0, 0, HOSTS, PROCESSES)
+
+    with screen:
+        view.draw()
+        view.look_again(look)
+        before = len(output.getvalue())
+        view.draw()
+    assert "has not answered" not in seen[0]
+    assert "the master has not answered for 0.0 s" in seen[1]
+    assert "has not answered" not in output.getvalue()[before:]
+
+
+def test_q_ends_top_while_the_master_is_silent():
+    """The key is read while the answer is awaited."""
+    view, screen, _ = _live("", "q")
+
+    def look(on_wait):
+        for seconds in (0.1, 0.2, 0.3):
+            on_wait(seconds)
+        raise AssertionError("q was not read")
+
+    with screen, pytest.raises(top_screen._Quit):
+        view.look_again(look)

@@ -125,6 +125,14 @@ def test_a_silent_master_is_noted_once(client, master, notes):
     assert notes == ["no answer. Asking again until the master answers"]
 
 
+def test_a_silence_of_the_master_is_noted_after_two_seconds(client, master, notes):
+    """Followed events and waits need not fail first; each silence is noted once, with its end."""
+    master.waits = (0.5, 2.1, 2.2, 9.0)
+    next(client.events(follow=True))
+    silence = "the master has not answered for 2 s; still waiting"
+    assert notes == [silence, "the master answers again"]
+
+
 def test_a_wait_says_why_it_is_not_done(client, master):
     """The error names processes that are pending, failed or no longer listed."""
     master.processes = [process("a", "starting"), process("b", "failed"), process("c")]

@@ -127,7 +127,7 @@ def test_a_host_without_the_capability_is_no_destination():
     assert "freezing does not work on b: CRIU 3.17 is too old" in reply.message
     anywhere = cluster.migrate("p")
     assert anywhere.message == (
-        "no host has room for p; freezing does not work on b: CRIU 3.17 is too old"
+        "no host can take p: freezing does not work on b: CRIU 3.17 is too old"
     )
     assert "freezing does not work on b" in " ".join(cluster.recorded("strategy_absent"))
 
@@ -147,7 +147,7 @@ def test_hosts_without_the_plugin_are_no_destinations() -> None:
     cluster = frozen(Host("a"), *(Machine(name, busy={"memory": 0.5}) for name in "bcde"))
     assert "is not installed there" in cluster.migrate("p", "b").message
     assert cluster.migrate("p").message == (
-        "no host has room for p; freezing does not work on b, c and 2 more: "
+        "no host can take p: freezing does not work on b, c and 2 more: "
         "the plugin of 'freezing' is not installed there"
     )
 

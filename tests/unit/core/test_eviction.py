@@ -266,7 +266,7 @@ def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> Non
     cluster.submit(movable("p", required_labels={"camera": "front"}))
     said = cluster.set_host("a", "drain").message
     assert said.endswith(
-        "nothing can leave: p may run on no other host (`rosrm explain NAME` shows the reason)"
+        "nothing can leave: p may run on no other host: b lacks the label camera=front"
     )
     cluster.wait(3.0)
     assert len(cluster.recorded("host_drained")) == 1

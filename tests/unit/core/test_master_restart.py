@@ -275,3 +275,16 @@ def test_the_status_of_another_process_with_the_same_number_changes_nothing() ->
         cluster.report("a", InstanceStatus(InstanceId("former", cluster["p"].owner), state))
     cluster.settle()
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
+def test_a_host_is_expected_until_it_reports_to_a_restarted_master() -> None:
+    """The listing does not call it lost before its lease has ended."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.kill_master()
+    cluster.machines["a"].connected = False
+    cluster.restart_master()
+    (row,) = listing.host_rows(cluster.state, cluster.now)
+    assert row.state == "expected"
+    cluster.wait(60.0)
+    (row,) = listing.host_rows(cluster.state, cluster.now)
+    assert row.state == "lost"

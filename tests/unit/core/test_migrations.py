@@ -7,11 +7,14 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.slave import events
+from rosrm.extensions.contracts import Scores
 from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.placement import SelectedFilter
 from rosrm.model.orders import StartInstance
 from rosrm.model.plan import AwaitReady, Commit, Execute, Move, Plan, SetRestart, Start, Step, Stop
 from rosrm.model.values import (
@@ -60,6 +63,82 @@ def moving_by(propose: Callable[[Move], Any], *, here: Any = EMPTY, **fields: An
     cluster = Cluster(*hosts, strategies=strategies, **fields)
     cluster.submit(process("p", migration=MigrationPolicy("strange")))
     return cluster
+
+
+# --- no destination ---------------------------------------------------------------------------
+
+
+def unwilling(**options):
+    """Return a cluster where p runs on a, and b and c may refuse it by these options."""
+    cluster = Cluster("a", **options).with_processes(
+        process("p", migration=MigrationPolicy("relaunch"))
+    )
+    for name in "bc":
+        cluster.add(Machine(name))
+    cluster.wait(1.0)
+    return cluster
+
+
+class OnlyA:
+    """A filter that passes a, and a scoring policy that vetoes all other hosts."""
+
+    def mask(self, hosts, process):
+        return np.array([name == "a" for name in hosts.names], np.bool_)
+
+    def reason(self, hosts, process, row):
+        return "it is not a"
+
+    def score(self, hosts, process):
+        veto = ~self.mask(hosts, process)
+        return Scores(np.zeros(len(veto)), veto, veto_reason=lambda row: "it is too far away")
+
+
+class Broken(OnlyA):
+    """A filter that fails for every host but a."""
+
+    def mask(self, hosts, process):
+        if tuple(hosts.names) == ("a",):
+            return super().mask(hosts, process)
+        raise RuntimeError("the map is not loaded")
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        ({"filters": (SelectedFilter("only", OnlyA()),)}, "is not a (filter only)"),
+        ({"policy": OnlyA()}, "is too far away"),
+    ],
+)
+def test_a_refusal_of_a_migration_names_the_plugin_that_refused(options, why) -> None:
+    """A move without a given host is refused with the reason of each host, equal ones once."""
+    message = unwilling(**options).migrate("p").message
+    assert message == f"no host can take p: each of b and c {why}"
+
+
+def test_a_refusal_of_a_migration_names_the_filter_that_failed() -> None:
+    """The error of a failing filter is the reason against each host."""
+    cluster = unwilling(filters=(SelectedFilter("broken", Broken()),))
+    message = cluster.migrate("p").message
+    assert "no host can take p: b and c: the filter broken failed: RuntimeError" in message
+
+
+def test_a_refusal_of_a_migration_tells_full_hosts_from_cordoned_ones() -> None:
+    """Each host has its own reason; a full one has no room."""
+    cluster = unwilling()
+    cluster.machines["b"].busy["memory"] = cluster.machines["c"].busy["memory"] = 0.9
+    cluster.set_host("b", "cordon")
+    cluster.wait(1.0)
+    message = cluster.migrate("p").message
+    assert message == "no host can take p: b is cordoned; c has no room"
+
+
+def test_a_drain_names_the_filter_that_keeps_a_process() -> None:
+    """The answer and the record of a drain have the same reason as a refused migration."""
+    cluster = unwilling(filters=(SelectedFilter("only", OnlyA()),))
+    message = cluster.set_host("a", "drain").message
+    cluster.wait(2.0)
+    for text in (message, *cluster.recorded("nothing_moves")):
+        assert "no host can take p: each of b and c is not a (filter only)" in text
 
 
 # --- forward ----------------------------------------------------------------------------------
@@ -114,7 +193,7 @@ def test_a_move_is_refused_with_its_reason() -> None:
     cluster = two_hosts()
     cluster.submit(process("fixed"), process("waits", memory=1e6))
     cases = [
-        (("x",), "no such process: 'x'; there are: waits, fixed, p "),
+        (("x",), "no such process: 'x'; there are: p, fixed, waits "),
         (("p", "z"), "no such host: 'z'; there are: a, b"),
         (("p", "a"), "p runs on a already"),
         (("fixed",), "has no migration strategy"),
@@ -369,6 +448,19 @@ def test_a_strategy_that_raises_or_proposes_an_unsound_plan_moves_nothing(
     assert fault.removeprefix("gave no plan: ") in message
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_duration_as_text_in_a_plan_is_named_with_its_path() -> None:
+    """The refusal names the field and the place of `propose`, and no comparison of types."""
+
+    def propose(move: Move) -> Plan:
+        plan = StartFirstOrStopFirst().propose(move)
+        wait = Execute("sleepy.wait", move.source_host, {}, "5s")  # type: ignore[arg-type]
+        return replace(plan, steps=(wait, *plan.steps))
+
+    message = moving_by(propose).migrate("p").message
+    assert "an unsound plan: steps[0].timeout" in message
+    assert f"({__file__}:{propose.__code__.co_firstlineno})" in message
 
 
 def test_a_strategy_that_cannot_move_a_process_does_not_fail() -> None:

@@ -342,7 +342,9 @@ def test_a_process_moves_to_no_host_of_one_from_which_it_must_be_apart() -> None
     for moved, there in (("p", "b"), ("q", "a")):
         other = "q" if moved == "p" else "p"
         assert f"it runs {other}, apart from which" in cluster.migrate(moved, there).message
-    assert cluster.migrate("p").message == "no host has room for p; it must run apart from q"
+    assert cluster.migrate("p").message == (
+        "no host can take p: b runs q, apart from which the process must run"
+    )
 
 
 def test_by_a_label_each_may_move_within_the_place() -> None:

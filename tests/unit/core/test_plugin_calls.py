@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rosrm.errors import PluginError
@@ -42,9 +43,9 @@ def test_a_failing_plugin_is_recorded_once_and_again_when_it_works() -> None:
         submitted(cluster, number)
     (message,) = cluster.recorded("plugin_failed")
     assert message.startswith("the scoring policy 'eq1' fails: score: KeyError: 'prefix' (")
-    reason = cluster.state.plugins.failing["scoring", "eq1"].reason
+    reason = cluster.state.plugins.failing["scoring", "eq1"].reason(cluster.now)
     assert reason.startswith("score: KeyError: 'prefix' (")
-    assert reason.endswith("; 3 failures so far")
+    assert "; 3 failures so far, the last " in reason
     policy.fails = False
     submitted(cluster, 4)
     assert ("scoring", "eq1") in cluster.state.plugins.failing
@@ -68,6 +69,42 @@ def test_an_error_of_rosrm_s_own_check_has_no_place() -> None:
     """The message about the answer is sufficient; no line of code is involved."""
     with pytest.raises(PluginError, match=r"^answered None; Scores is required$"):
         PluginCalls().ask("scoring", "x", "score", lambda: required(None, Scores))
+
+
+class Silent:
+    """Scoring policy that lacks a `return`."""
+
+    def score(self, hosts: Any, process: Any) -> Any:
+        """Return nothing."""
+
+
+class Refusing:
+    """Scoring policy that vetoes each host without a reason."""
+
+    def score(self, hosts: HostView, process: ProcessView) -> Scores:
+        veto = np.ones(len(hosts.names), np.bool_)
+        return Scores(np.zeros(len(veto)), veto, veto_reason=self.why)
+
+    def why(self, row: int) -> Any:
+        """Return nothing."""
+
+
+def test_a_wrong_answer_is_named_with_the_place_of_the_method() -> None:
+    """No exception shows the place, so the text has file and line of the definition."""
+    cluster = Cluster("a", policy=Silent())
+    submitted(cluster, 1)
+    (message,) = cluster.recorded("plugin_failed")
+    place = f"{__file__}:{Silent.score.__code__.co_firstlineno}"
+    assert message.endswith(f"score: answered None; Scores is required ({place})")
+
+
+def test_a_reason_that_is_no_text_is_named_with_the_place_of_the_method() -> None:
+    """A veto without a reason does not become the word None."""
+    cluster = Cluster("a", policy=Refusing())
+    submitted(cluster, 1)
+    (host,) = cluster.explain("p1")["decision"]["hosts"]
+    place = f"{__file__}:{Refusing.why.__code__.co_firstlineno}"
+    assert f"answered None; str is required ({place})" in host["reason"]
 
 
 class Wordless(Exception):

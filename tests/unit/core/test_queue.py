@@ -92,11 +92,12 @@ def test_nothing_is_set_aside_before_the_limits_are_known(monkeypatch) -> None:
 
 def test_a_misspelt_resource_is_named_with_the_nearest_that_is_reported() -> None:
     """The process is set aside, because a host that reports the resource may still register."""
-    cluster = Cluster("a", "b").with_processes(process("p", needs={"memroy": 1e6}))
-    assert cluster["p"].reason == (
-        "no host may take it: no host reports the resource 'memroy'; did you mean 'memory'? "
-        "(reported: cpu, memory)"
-    )
+    cluster = Cluster("a", "b")
+    reply = cluster.submit(process("p", needs={"memroy": 1e6}))
+    fault = "no host reports the resource 'memroy'; did you mean 'memory'? "
+    fault += "(reported: cpu, memory)"
+    assert cluster["p"].reason == f"no host may take it: {fault}"
+    assert reply.message == f"1 process queued. Warning: {fault}"
 
 
 def test_restart_of_a_process_that_waits_for_room_is_refused() -> None:

@@ -191,6 +191,12 @@ def test_an_unknown_name_refuses_the_whole_request() -> None:
     assert cluster.phase("talker") == "running"
 
 
+def test_an_unknown_name_is_refused_with_the_known_ones_in_order() -> None:
+    """The names have the order of their submission, as in `rosrm ps`."""
+    cluster = Cluster("a").with_processes(*map(process, ("camera", "arm", "driver")))
+    assert "there are: camera, arm, driver (" in cluster.cancel("zzz").message
+
+
 @pytest.mark.parametrize("overlap", [True, False])
 def test_cancel_during_a_move_ends_both_instances(overlap: bool) -> None:
     """The move is undone at once, and no fallback is started."""

@@ -99,3 +99,11 @@ def test_ctrl_c_during_an_import_is_not_taken_for_a_fault(install):
     install("vx_stop", "raise KeyboardInterrupt")
     with pytest.raises(KeyboardInterrupt):
         Registry.discover()
+
+
+def test_what_a_plugin_prints_at_its_import_is_no_output_of_a_command(install, capsys):
+    """The text goes to standard error, so that the output with --json is JSON alone."""
+    install("vx_loud", "print('loaded')\n" + GOOD.format(name="loud"))
+    Registry.discover()
+    output = capsys.readouterr()
+    assert (output.out, "loaded\n" in output.err) == ("", True)

@@ -215,9 +215,16 @@ def test_a_name_offered_twice_belongs_to_neither_and_both_are_named():
         a=plugin(ScoringOffer("s", lambda options: 1)),
         b=plugin(ScoringOffer("s", lambda options: 2)),
     )
-    with pytest.raises(ConfigError, match="offered twice, by plugin 'a' and plugin 'b': uninstall"):
+    with pytest.raises(ConfigError, match="offered by plugin 'a' and plugin 'b': uninstall"):
         registry.scoring("s")
     assert {row.state for row in registry.rows()} == {"broken"}
+
+
+def test_a_name_that_one_plugin_offers_twice_is_to_be_renamed():
+    """Nothing can be uninstalled, so the remedy is another name."""
+    twice = plugin(ScoringOffer("s", lambda options: 1), ScoringOffer("s", lambda options: 2))
+    with pytest.raises(ConfigError, match="offered 2 times by plugin 'a': rename all but one"):
+        Registry.of(a=twice).scoring("s")
 
 
 @pytest.mark.parametrize(
@@ -227,6 +234,7 @@ def test_a_name_offered_twice_belongs_to_neither_and_both_are_named():
         ("cpu", "returned str, not a list of ProbeOffer"),
         ([ScoringOffer("s", lambda options: None)], "which is not a ProbeOffer"),
         ([ProbeOffer("", Probe)], "offers something without a name: ''"),
+        ([ProbeOffer("PG flow!", Probe)], "offers the name 'PG flow!'; allowed: at most 64"),
         ([ProbeOffer("p", None)], "'p': `create` cannot be called"),
         ([ProbeOffer("p", Probe, options=dict)], "'p': `options` is not a dataclass"),
         ([ProbeOffer("p", Probe, options=Reading)], "'p': option 'resource' has no default"),
@@ -257,7 +265,7 @@ MISSPELT = (
     r"^unknown hook 'register_probe' \(.*did you mean 'register_probes'\? "
     r"Allowed: register_probes, register_sc"
 )
-SURPLUS = "{'config'} are declared in the hookimpl but can not be found"
+SURPLUS = "TypeError: it has the parameters config; a hook has none"
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import re
+import sys
 import time
 
 import pytest
@@ -31,6 +33,36 @@ def swallow():
     spin()
 
 
+def work():
+    return sum(range(1000))
+
+
+def catch_everything():
+    """Catch every interrupt, and continue."""
+    while True:
+        try:  # noqa: SIM105 - as a careless plugin does
+            work()
+        except BaseException:  # noqa: BLE001
+            pass
+
+
+def catch_everything_twice():
+    """Call a loop that catches every interrupt in another one."""
+    while True:
+        try:  # noqa: SIM105
+            catch_everything()
+        except BaseException:  # noqa: BLE001
+            pass
+
+
+def catch_and_answer():
+    """Answer late, after an interrupt."""
+    try:
+        spin()
+    except BaseException:  # noqa: BLE001
+        return "scores"
+
+
 def test_one_that_answers_is_passed_on() -> None:
     """The caller gets its answer or error, and no alarm follows."""
     ask = deadlines()
@@ -40,7 +72,18 @@ def test_one_that_answers_is_passed_on() -> None:
     time.sleep(0.15)
 
 
-@pytest.mark.parametrize("act", [spin, lambda: time.sleep(100), swallow])
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(
+    "act",
+    [
+        spin,
+        lambda: time.sleep(100),
+        swallow,
+        catch_everything,
+        catch_everything_twice,
+        catch_and_answer,
+    ],
+)
 def test_one_that_hangs_is_ended(act) -> None:
     """The deadline also ends a plugin that sleeps or swallows the error."""
     ask = deadlines()
@@ -96,3 +139,20 @@ def test_a_plugin_cannot_end_the_master_by_an_interrupt() -> None:
 
     with pytest.raises(PluginError, match="KeyboardInterrupt: mine"):
         deadlines()(SLOW, interrupts)
+
+
+@pytest.mark.timeout(60)
+def test_a_plugin_that_catches_its_interrupt_is_logged_with_its_place(caplog) -> None:
+    """The log has the file and line where an overdue plugin still runs."""
+    with pytest.raises(TimeoutError):
+        deadlines()(SLOW, catch_everything)
+    assert "catches its interrupt" in caplog.text
+    assert re.search(r"test_plugin_deadline\.py:\d+", caplog.text)
+
+
+def test_the_trace_function_of_a_debugger_is_kept() -> None:
+    """After the interrupt of a plugin the process has its own trace function again."""
+    before = sys.gettrace(), sys.getprofile()
+    with pytest.raises(TimeoutError):
+        deadlines()(SLOW, catch_everything)
+    assert (sys.gettrace(), sys.getprofile()) == before

@@ -73,6 +73,20 @@ def test_a_policy_that_fails_is_shown_as_failing() -> None:
     assert rows(cluster, failing=True) == [row]
 
 
+def test_a_policy_that_worked_since_its_failure_is_shown_so() -> None:
+    """The row has the age of the last failure, and says that a call has succeeded since."""
+    cluster = Cluster("a")
+    with pytest.raises(PluginError):
+        cluster.state.plugins.ask("scoring", "eq1", "score", lambda: 1 / 0)
+    cluster.wait(3.0)
+    assert named(cluster, "eq1").reason.endswith("; 1 failure so far, the last 2.9 s ago")
+    cluster.state.plugins.ask("scoring", "eq1", "score", lambda: "scores")
+    cluster.wait(1.0)
+    assert named(cluster, "eq1").reason.endswith("the last 3.9 s ago; it has succeeded since")
+    cluster.wait(10.0)
+    assert named(cluster, "eq1").state == "selected"
+
+
 def test_a_probe_that_fails_is_shown_as_failing_on_its_host() -> None:
     """The row has the slave's reason until a report without it."""
     cluster = Cluster("a", "b")

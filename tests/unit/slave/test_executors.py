@@ -95,6 +95,7 @@ def test_an_error_of_rosrm_is_the_whole_message() -> None:
         ({"x": object()}, "x: object"),
         ({"fine": [1, "a", None, 0.5], "pose": {"at": [0.0, {1}]}}, "pose.at[1]: set"),
         ({(1, 2): 3}, "the key (1, 2): tuple"),
+        ({"speed": [0.5, float("nan")]}, "speed[1]: nan"),
     ],
 )
 def test_an_answer_that_json_cannot_hold_is_named_by_its_key_and_type(answer, said) -> None:

@@ -147,11 +147,12 @@ def test_raising_probe_is_stale_and_recovers(bad, fault):
     ],
 )
 def test_an_answer_that_is_not_one_reading_of_each_resource_is_named(bad, answer, reason):
-    """A missing `return` or `Reading` gives a message and no AttributeError."""
+    """A missing `return` or `Reading` gives a message with the place of `read`."""
     probe, made = bad
     probe.read = lambda: answer
     assert made.tick(3).stale == 1
-    assert made.reports == [f"probe bad: cpu stale: {reason}"]
+    place = f"{__file__}:{probe.read.__code__.co_firstlineno}"
+    assert made.reports == [f"probe bad: cpu stale: {reason} ({place})"]
 
 
 def test_the_place_at_which_a_probe_raised_is_reported(bad):

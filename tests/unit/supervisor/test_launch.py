@@ -227,6 +227,15 @@ def test_a_launch_that_is_too_long_for_the_supervisor_is_refused(tmp_path, field
         order(tmp_path, command=("node",), **fields)
 
 
+def test_a_package_with_an_unlike_name_is_no_suggestion(prefix):
+    """Two words of one suffix are not misspelt forms of each other."""
+    index = prefix / "share" / "ament_index" / "resource_index" / "packages"
+    (index / "tracetools").touch()
+    with pytest.raises(LaunchError) as caught:
+        find_executable("image_tols", "x", [prefix])
+    assert "did you mean" not in str(caught.value)
+
+
 def test_a_few_packages_are_listed_and_many_counted(prefix):
     """The first names of many would not help; their number shows that the path is not empty."""
     with pytest.raises(LaunchError, match="'quux' was not found; there: demo_nodes"):

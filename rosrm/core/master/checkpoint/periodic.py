@@ -112,7 +112,9 @@ def _discard_of(state: MasterState, name: str) -> str | Rejected | None:
         return None
     asked = strategy
     try:
-        return state.plugins.ask("migration", name, "discard", lambda: required(asked.discard, str))
+        return state.plugins.ask(
+            "migration", name, "discard", lambda: required(asked.discard, str), asked
+        )
     except PluginError as error:
         return Rejected(str(error))
 
@@ -142,13 +144,15 @@ def _pace(
     try:
         asked = state.plugins.ask(
             "migration", asked_of, "checkpoint_every",
-            lambda: float(strategy.checkpoint_every(process.spec)),
+            lambda: float(strategy.checkpoint_every(process.spec)), strategy,
         )  # fmt: skip
         if not asked > 0.0:
             return None
         view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
         asked_of = name
-        return state.plugins.ask("checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view)))
+        return state.plugins.ask(
+            "checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view)), pacing
+        )
     except PluginError as error:
         return Rejected(f"{asked_of!r} sets no pace: {error}")
 
@@ -171,7 +175,9 @@ def _order(
         return checked(step, "step")
 
     try:
-        step = state.plugins.ask("migration", spec.migration.strategy or "", "periodic", ask)
+        step = state.plugins.ask(
+            "migration", spec.migration.strategy or "", "periodic", ask, strategy
+        )
     except PluginError as error:
         _record_trouble(state, dumped, str(error), now)
         return

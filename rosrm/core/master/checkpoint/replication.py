@@ -230,8 +230,9 @@ def _choice(
     )  # fmt: skip
     try:
         return state.plugins.ask(
-            "checkpoint", policy_name, "choose", lambda: sound_choice(policy.choose(view), view)
-        )
+            "checkpoint", policy_name, "choose", lambda: sound_choice(policy.choose(view), view),
+            policy,
+        )  # fmt: skip
     except PluginError:
         return None
 

@@ -56,7 +56,7 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     state.capability_answers[name, host.name] = answer
     try:
         executor = state.plugins.ask(
-            "migration", name, "host_check", lambda: required(strategy.host_check, str)
+            "migration", name, "host_check", lambda: required(strategy.host_check, str), strategy
         )
     except PluginError as error:
         answer.reason = f"its host check is not known: {error}"
@@ -109,8 +109,9 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
     asked = checking
     try:
         return state.plugins.ask(
-            "migration", strategy, "host_fault", lambda: required(asked.host_fault(*facts), str)
-        )
+            "migration", strategy, "host_fault", lambda: required(asked.host_fault(*facts), str),
+            asked,
+        )  # fmt: skip
     except PluginError as error:
         return f"the check of the hosts by {strategy} failed: {error}"
 

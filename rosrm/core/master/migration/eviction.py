@@ -19,6 +19,7 @@ from rosrm.core.master.assignment.assign import (
     joint_demand,
     measured_need,
     ranking_of,
+    unable,
 )
 from rosrm.core.master.assignment.neighbours import moving_neighbour, running_with
 from rosrm.core.master.hosts import capabilities
@@ -35,8 +36,13 @@ from rosrm.core.master.migration.start import (
     without_executor,
 )
 from rosrm.core.master.outcomes import Rejected
-from rosrm.core.master.scheduling.decision import decide, verdict_of
-from rosrm.core.master.scheduling.feasibility import may_ever_take, why_each_closed
+from rosrm.core.master.scheduling.decision import (
+    NO_ROOM,
+    decide,
+    verdict_of,
+    why_each_refuses,
+)
+from rosrm.core.master.scheduling.feasibility import may_ever_take, why_each_never
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import Host, HostCondition
@@ -48,7 +54,9 @@ from rosrm.wording import by_reason, counted, each_of, few, listed
 
 #: Shortest time, in seconds, between two `nothing_moves` records of a host with different reasons.
 _RECORD_PERIOD: Final = 10.0
-#: Highest number of reasons against hosts in one answer.
+#: Highest number of hosts of which one answer gives the reasons; more plugin calls take too long.
+_MOST_HOSTS: Final = 16
+#: Highest number of a strategy's reasons against hosts in one answer.
 _MOST_REASONS: Final = 3
 _UNMEASURED: Final = "and its use by single processes is not measured"
 _ALONE: Final = "there is no other host"
@@ -299,12 +307,7 @@ def _destination(
     if host is None:
         column = ranking.best()
         if column < 0:
-            if _is_alone(state, source):
-                return Rejected(_ALONE)
-            why = _and_neighbours(ranking.demand) + _and_why(state, process, source)
-            closed = _why_closed(state, source)
-            text = f"no host can take {process.name}: {closed}" if closed else ""
-            return Rejected((text or f"no host has room for {process.name}") + why)
+            return Rejected(_why_nowhere(state, process, ranking, source))
         return state.hosts.hosts[column]
     if host is source:
         return Rejected(f"{process.name} runs on {host.name} already")
@@ -318,27 +321,20 @@ def _is_alone(state: MasterState, source: Host) -> bool:
     return all(host is source for host in state.hosts.listed())
 
 
-def _why_closed(state: MasterState, source: Host) -> str:
-    """Return why each other host takes no process at all; "": one of them may."""
-    others = [host.column for host in state.hosts.listed() if host is not source]
-    refusals = why_each_closed(state.hosts, others)
-    return by_reason(refusals) if len(refusals) == len(others) else ""
-
-
-def _and_why(state: MasterState, process: Process, source: Host) -> str:
-    """Return the first reasons of the strategy against hosts; "" for none."""
+def _why_nowhere(state: MasterState, process: Process, ranking: Ranking, source: Host) -> str:
+    """Return why no other host can take a process now: each reason once, with its hosts."""
+    others = [host for host in state.hosts.listed() if host is not source]
+    if not others:
+        return _ALONE
+    unable_hosts = unable(state, process, source.name)
+    asked = [host for host in others if host.name not in unable_hosts]
+    found = why_each_refuses(ranking, [host.column for host in asked[:_MOST_HOSTS]])
+    if len(asked) == len(others) and all(reason == NO_ROOM for _, reason in found):
+        return f"no host has room for {process.name}"
+    more = counted(len(asked) - _MOST_HOSTS, "more host") if len(asked) > _MOST_HOSTS else ""
     faults = capabilities.faults(state, process.spec.migration.strategy or "", source)
-    return "".join(f"; {fault}" for fault in few(faults, _MOST_REASONS))
-
-
-def _and_neighbours(demand: Demand) -> str:
-    """Return a phrase on each required rule of a demand on its neighbours; "" for none."""
-    rules = [rule for rule in demand.neighbours if not rule.prefer and rule.at]
-    return "".join(
-        f"; it must run {rule.relation} {'' if rule.relation == 'near' else 'from '}"
-        f"{listed(dict.fromkeys(name for _, name in rule.at))}"
-        for rule in rules
-    )
+    reasons = [by_reason(found), more, *few(faults, _MOST_REASONS)]
+    return f"no host can take {process.name}: {'; '.join(filter(None, reasons))}"
 
 
 # --- drain ------------------------------------------------------------------------------------
@@ -419,7 +415,9 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
         return ""
     if _is_alone(state, source):
         return _ALONE
-    return f"{process.name} may run on no other host (`rosrm explain NAME` shows the reason)"
+    others = [host.column for host in state.hosts.listed() if host is not source]
+    why = by_reason(why_each_never(state.hosts, demand, others[:_MOST_HOSTS]))
+    return f"{process.name} may run on no other host: {why}"
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:

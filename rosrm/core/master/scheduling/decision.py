@@ -13,7 +13,13 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from rosrm.core.master.scheduling.candidates import Candidates, candidates
-from rosrm.core.master.scheduling.filters import BY_ASSIGNMENT, Refusal, first_of, refusals
+from rosrm.core.master.scheduling.filters import (
+    BY_ASSIGNMENT,
+    OF_ROOM,
+    Refusal,
+    first_of,
+    refusals,
+)
 from rosrm.core.master.scheduling.host_views import host_view, process_view
 from rosrm.core.master.scheduling.proximity import unmet
 from rosrm.core.master.scheduling.ranking import TIE, Ranking
@@ -24,11 +30,14 @@ from rosrm.extensions.contracts import Scores
 from rosrm.extensions.placement import ScoringLink
 from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.model.values import EMPTY
+from rosrm.wording import first_line
 
 #: Largest number of hosts that an explanation names all; of more, it names the best fitting ones.
 _NAMED_HOSTS: Final = 16
 #: Reason against a host if a plugin has failed, or gives another answer, since the decision.
 _NO_REASON: Final = "a plugin refused it that gives no reason now; see `rosrm plugins`"
+#: Reason against a host that fails a filter of `OF_ROOM`, where a text must not change at once.
+NO_ROOM: Final = "it has no room"
 #: Kind of a decision; "": not set yet.
 DecisionKind = Literal["", "assigned", "set_aside", "waits", "migrated"]
 
@@ -74,7 +83,9 @@ class Part:
         ask = self.scores.veto_reason if veto else self.scores.reason
         hook = "veto_reason" if veto else "reason"
         try:
-            return self.plugins.ask("scoring", self.link.name, hook, lambda: str(ask(at)))
+            return self.plugins.ask(
+                "scoring", self.link.name, hook, lambda: required(ask(at), str), self.scores
+            )
         except PluginError as error:
             return f"(no reason, because the policy failed: {error})"
 
@@ -189,6 +200,25 @@ def verdict_of(ranking: Ranking, column: int) -> Verdict:
     return _verdicts(_moment(ranking, [column]), chosen=False)[0]
 
 
+def why_each_refuses(ranking: Ranking, columns: Sequence[int]) -> list[tuple[str, str]]:
+    """Return the name of each of these hosts, none of which fits, and the reason in one line.
+
+    The reason of a full host is `NO_ROOM`, without its changing numbers.
+    """
+    moment = _moment(ranking, list(columns))
+    refused = moment.refusals()
+    parts = moment.parts() if None in refused else ()
+    return [
+        (
+            moment.hosts.host(at).name,
+            NO_ROOM
+            if refusal is not None and refusal.filter.name in OF_ROOM
+            else first_line(_verdict(moment, parts, refusal, at, chosen=False).reason),
+        )
+        for at, refusal in enumerate(refused)
+    ]
+
+
 def _moment(ranking: Ranking, columns: list[int]) -> Moment:
     at = np.array(columns, np.int64)
     hosts = candidates(ranking.table, ranking.demand, ranking.need, at)
@@ -246,7 +276,8 @@ def _scores_of(link: ScoringLink, hosts: Candidates) -> Scores | None:
     views = host_view(hosts), process_view(hosts, link.reads)
     try:
         return hosts.demand.plugins.calls.ask(
-            "scoring", link.name, "score", lambda: required(link.policy.score(*views), Scores)
-        )
+            "scoring", link.name, "score", lambda: required(link.policy.score(*views), Scores),
+            link.policy,
+        )  # fmt: skip
     except PluginError:
         return None  # the decision itself does not need the reasons

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -30,7 +30,6 @@ _NAMED_HOSTS: Final = 16
 _PERMANENT: Final = tuple(one for one in FILTERS if one.lasts is Lasts.PERMANENT)
 _AWAY: Final = tuple(one for one in FILTERS if one.lasts is Lasts.AWAY)
 _ABSENT: Final = tuple(one for one in FILTERS if one.lasts in (Lasts.AWAY, Lasts.RETURN))
-_CLOSED: Final = tuple(one for one in FILTERS if one.name in ("gone", "expected", "cordon"))
 _LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
 
 
@@ -78,12 +77,14 @@ def why_all_away(table: HostTable, demand: Demand) -> str:
     return f"every host is away: {_host_by_host(_ABSENT, table, demand)}"
 
 
-def why_each_closed(table: HostTable, columns: Sequence[int]) -> list[tuple[str, str]]:
-    """Return the name of each of these hosts that is away or takes no work, and why."""
-    hosts = as_if_empty(table, Demand(ProcessSpec(""), {}), np.array(columns, np.int64))
-    found = refusals(_CLOSED, hosts)
+def why_each_never(
+    table: HostTable, demand: Demand, columns: Sequence[int]
+) -> list[tuple[str, str]]:
+    """Return the name of each of these hosts that may never take a demand, and why."""
+    hosts = as_if_empty(table, demand, np.array(columns, np.int64))
+    found = refusals(_PERMANENT, hosts)
     return [
-        (hosts.host(row).name, refusal.reason)
+        (hosts.host(row).name, first_line(refusal.reason))
         for row, refusal in enumerate(found)
         if refusal is not None
     ]
@@ -122,14 +123,23 @@ def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -
     return f"{summary}; and {counted(more, 'more host')}" if more else summary
 
 
+def unknown_resources(table: HostTable, specs: Iterable[ProcessSpec]) -> list[str]:
+    """Return a sentence on each needed resource that no host reports; [] without any host."""
+    needed = {name for spec in specs for name in spec.needs}
+    return [_unknown(name, table) for name in sorted(needed - set(table.resources)) if len(table)]
+
+
 def _unmeasured(table: HostTable, demand: Demand) -> str:
     """Return a sentence on a resource that no host reports, with a near name; "": none."""
-    for resource in sorted(demand.declared - set(table.resources)):
-        near = get_close_matches(resource, table.resources, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        there = ", ".join(sorted(table.resources)) or "none"
-        return f"no host reports the resource {resource!r}{hint} (reported: {there})"
-    return ""
+    unknown = sorted(demand.declared - set(table.resources))
+    return _unknown(unknown[0], table) if unknown else ""
+
+
+def _unknown(resource: str, table: HostTable) -> str:
+    near = get_close_matches(resource, table.resources, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    there = ", ".join(sorted(table.resources)) or "none"
+    return f"no host reports the resource {resource!r}{hint} (reported: {there})"
 
 
 def _unknown_device(table: HostTable, demand: Demand) -> str:

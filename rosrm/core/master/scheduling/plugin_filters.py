@@ -56,12 +56,14 @@ def _mask(one: SelectedFilter, hosts: Candidates) -> BoolArray:
 def _asked_mask(one: SelectedFilter, hosts: Candidates) -> BoolArray:
     views = host_view(hosts), process_view(hosts, one.reads)
     return hosts.demand.plugins.calls.ask(
-        "filter", one.name, "mask", lambda: checked_mask(one.filter.mask(*views), len(hosts))
-    )
+        "filter", one.name, "mask", lambda: checked_mask(one.filter.mask(*views), len(hosts)),
+        one.filter,
+    )  # fmt: skip
 
 
 def _reason(one: SelectedFilter, hosts: Candidates, row: int) -> str:
     views = host_view(hosts), process_view(hosts, one.reads)
     return hosts.demand.plugins.calls.ask(
-        "filter", one.name, "reason", lambda: required(one.filter.reason(*views, row), str)
-    )
+        "filter", one.name, "reason", lambda: required(one.filter.reason(*views, row), str),
+        one.filter,
+    )  # fmt: skip

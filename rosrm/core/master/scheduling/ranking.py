@@ -284,7 +284,7 @@ def _answer(
     views = host_view(hosts), process_view(hosts, link.reads)
     score, veto = hosts.demand.plugins.calls.ask(
         "scoring", link.name, "score",
-        lambda: checked_scores(link.policy.score(*views), views[0], fits),
+        lambda: checked_scores(link.policy.score(*views), views[0], fits), link.policy,
     )  # fmt: skip
     if len(hosts.demand.plugins.chain) > 1 or link.weight != 1.0:
         score = link.weight * np.clip(np.nan_to_num(score), -_LARGEST_SCORE, _LARGEST_SCORE)
