@@ -33,23 +33,28 @@ class Handover:
         settings: JSON of `ClusterConfig` or `HostConfig`.
         plugins: every installed plugin.
         source: origin of the settings, for a reload.
+        parent: pid of the process with which the runtime ends; 0: none.
     """
 
     settings: str
     plugins: tuple[PluginAddress, ...]
     source: SettingsSource
+    parent: int = 0
 
 
-def hand_over(settings: str, source: SettingsSource) -> int:
+def hand_over(settings: str, source: SettingsSource, parent: int = 0) -> int:
     """Write the input of a runtime; return the file descriptor that the runtime is to inherit.
 
     Args:
         settings: JSON of the checked settings.
         source: origin of the settings.
+        parent: pid of the parent, if the runtime ends with its parent; 0: it does not.
     """
     plugins = [[one.name, one.target, one.distribution] for one in installed_plugins()]
     descriptor = os.memfd_create("rosrm-settings", 0)
-    handed = {"settings": settings, "plugins": plugins, "source": astuple(source)}
+    handed = {
+        "settings": settings, "plugins": plugins, "source": astuple(source), "parent": parent,
+    }  # fmt: skip
     os.write(descriptor, json.dumps(handed).encode())
     os.lseek(descriptor, 0, os.SEEK_SET)
     return descriptor
@@ -80,7 +85,9 @@ def take_over(command_line: Sequence[str]) -> Handover:
     with os.fdopen(int(command_line[1])) as source:
         handed = json.load(source)
     plugins = tuple(PluginAddress(*address) for address in handed["plugins"])
-    return Handover(handed["settings"], plugins, SettingsSource(*handed["source"]))
+    return Handover(
+        handed["settings"], plugins, SettingsSource(*handed["source"]), handed["parent"]
+    )
 
 
 _Handler = Callable[[int, FrameType | None], None]
@@ -139,7 +146,12 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
     output.setFormatter(LogFormatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
     logging.basicConfig(level=logging.INFO, handlers=[output])
     try:
-        return serve(take_over(sys.argv[1:]))
+        handover = take_over(sys.argv[1:])
+        if handover.parent:
+            from rosrm.runtime.parent_death import end_with_parent  # noqa: PLC0415 - ctypes
+
+            end_with_parent(handover.parent)
+        return serve(handover)
     except RosrmError as error:
         sys.stderr.write(printable(f"rosrm {role}: {error}\n"))
         return error.exit_code

@@ -55,7 +55,7 @@ def master(
     registry = Registry.discover()
     file = config or ctx.ensure_object(CommonOptions).cluster
     settings = load_cluster(file, registry) if file else default_cluster(registry)
-    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    settings = replace(settings, ros=with_domain(settings.ros, ctx, domain))
     if recover:
         echo(_recover(settings.state), err=True)
     with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
@@ -92,7 +92,7 @@ def slave(
 
     registry = Registry.discover()
     settings = load_host(config, registry) if config else HostConfig()
-    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    settings = replace(settings, ros=with_domain(settings.ros, ctx, domain))
     if stop_everything:
         if not (settings.state / "supervisor").is_dir():
             echo(f"nothing to stop: no slave was started with the state directory {settings.state}")
@@ -139,7 +139,8 @@ def _chosen_domain(ctx: typer.Context, domain: int | None) -> int | None:
     return ctx.ensure_object(CommonOptions).domain if domain is None else domain
 
 
-def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+def with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+    """Return checked ROS settings, with the domain of the command line if it names one."""
     from rosrm.ros.network_interface import check_interface
 
     chosen = _chosen_domain(ctx, domain)
