@@ -18,6 +18,7 @@ from rosrm.cli.waiting import show_change
 from rosrm.client.client import Client
 from rosrm.client.connecting import check_name
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
+from rosrm.client.retrying import ask_until_answered
 from rosrm.client.waiting import ENDED
 from rosrm.config.checking import near
 from rosrm.config.documents import Node, Place, node_of
@@ -143,14 +144,15 @@ def run(client: Client, spec: ProcessSpec) -> int:
         try:
             client.submit(spec)
             return job.follow()
+        except BrokenPipeError:  # nothing reads the output any more, as after `| head`
+            job.cancel()
+            raise
         except KeyboardInterrupt:
-            if job.signal == signal.SIGHUP:
-                with suppress(OSError):
-                    job.cancel()
-                return _SIGNALLED + job.signal
+            pass
         try:
             job.cancel()
-            job.follow()
+            if job.signal != signal.SIGHUP:  # a closed terminal takes no output
+                job.follow()
         except KeyboardInterrupt:
             note(
                 f"{spec.name} may still be stopping: `rosrm ps` shows its state, "
@@ -199,9 +201,10 @@ class _Job:
 
     def cancel(self) -> None:
         """Cancel the job, unless it has ended or was never queued."""
-        note(f"cancelling {self.name}; Ctrl-C again leaves at once")
         with suppress(Refused):
             self.client.cancel(self.name)
+        with suppress(OSError):  # a closed terminal
+            note(f"cancelling {self.name}; Ctrl-C again leaves at once")
 
     def follow(self) -> int:
         """Copy the output of the job until it has ended; return the exit code."""
@@ -217,16 +220,20 @@ class _Job:
                 time.sleep(PERIOD)
 
     def _row(self) -> ProcessRow | None:
-        rows = {row.name: row for row in self.client.list_processes()}
-        return rows.get(self.name)
+        listed = ask_until_answered(self.client.list_processes, note)
+        return next((row for row in listed if row.name == self.name), None)
 
     def _copy(self, *, has_ended: bool) -> bool:
         """Copy new output; return False if there was none."""
         try:
             news = self._read() if not self._begun and has_ended else self._poll()
-        except (NoMaster, Refused) as error:
-            if not has_ended:
-                self._note_once(str(error))
+        except NoMaster as error:
+            self._reader.silent.clear()  # ask the host again, because the job may run for hours
+            self._note_once(str(error))
+            return False
+        except Refused as refusal:
+            if not has_ended:  # otherwise its end says more, e.g. that it could not be started
+                self._note_once(str(refusal))
             return False
         show(self._stream.take())
         return news
@@ -271,7 +278,7 @@ class _Job:
         if row.state == "finished":
             return 0
         code = row.exit_code or 0
-        if not self.signal and (row.state == "cancelled" or not code or "limit" in row.reason):
+        if not self.signal and row.reason != f"exit code {code}":
             reason = f": {row.reason}" if row.reason else ""
             note(printable(f"{self.name} {standing(row.state)}{reason}"))
         return _SIGNALLED - code if code < 0 else code or _FAILED

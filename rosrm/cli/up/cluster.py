@@ -112,7 +112,10 @@ def _error_of(part: Part) -> RosrmError:
             return RosrmError("\n".join([line.removeprefix(own), *lines[at + 1 :]]))
     subject = "the master" if role == "master" else f"the slave of {part.name}"
     last = "".join(f"\n    {line}" for line in lines[-_LINES:])
-    return PartEnded(f"{subject} has ended ({_how(part)}). Its log is {part.log}:{last}")
+    return PartEnded(
+        f"{subject} has ended ({_how(part)}). Its log is {part.log}, in a directory that stays; the "
+        f"last lines:{last}"
+    )
 
 
 def _how(part: Part) -> str:

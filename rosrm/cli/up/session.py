@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import typer
 
@@ -16,17 +16,19 @@ from rosrm.cli.output.tables import event_line
 from rosrm.cli.process import INTERRUPTED
 from rosrm.cli.up.cluster import UpCluster
 from rosrm.client.waiting import ENDED
-from rosrm.errors import NoMaster
+from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow
 from rosrm.model.values import ProcessSpec
-from rosrm.wording import amount, counted, listed
+from rosrm.wording import amount, counted, first_line, listed
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 #: Seconds between two polls of events and parts.
 _PERIOD: Final = 0.3
 #: Number of events in one listing that leaves out none, as in `List.srv`.
 _ALL_NEW: Final = 2**32 - 1
-_UNITS: Final = {"memory": "B", "disk": "B", "cpu": "core"}
 #: Kinds of events that are shown: starts and ends of processes, moves, and problems.
 _SHOWN: Final = frozenset({
     EventKind.READY, EventKind.RUNNING, EventKind.REACHABLE, EventKind.BACKOFF, EventKind.FINISHED,
@@ -59,13 +61,17 @@ def serve(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
         typer.Exit: a second signal has killed the cluster.
         RosrmError: a part was refused or has ended, or the processes were refused.
     """
-    with _signals():
+    with _Signals() as signals:
         try:
             try:
                 _run(cluster, specs)
             except _Stopped:
                 _say("ending: the processes stop first; Ctrl-C again kills everything at once")
+            except RosrmError as error:
+                _say(f"ending everything: {first_line(str(error))}")
+                raise
             finally:
+                signals.hurry_next()
                 cluster.end()
         except _Hurried:
             cluster.kill()
@@ -74,22 +80,28 @@ def serve(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
     _say("ended; nothing runs any more")
 
 
-@contextmanager
-def _signals() -> Iterator[None]:
-    """Turn the first signal into `_Stopped`, the second into `_Hurried`, and ignore others."""
-    left: list[type[BaseException]] = [_Stopped, _Hurried]
+class _Signals:
+    """Turns a first signal into `_Stopped`, a further one into `_Hurried`, and ignores others."""
 
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        if left:
-            raise left.pop(0)
+    def __init__(self) -> None:
+        self._next: list[type[BaseException]] = [_Stopped, _Hurried]
 
-    ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, handle) for number in ending}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
+    def __enter__(self) -> Self:
+        ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        self._before = {number: signal.signal(number, self._handle) for number in ending}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
             signal.signal(number, handler)
+
+    def hurry_next(self) -> None:
+        """Turn the next signal into `_Hurried`, because the end has begun."""
+        self._next = [one for one in self._next if one is not _Stopped]
+
+    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+        if self._next:
+            raise self._next.pop(0)
 
 
 def _run(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
@@ -107,16 +119,20 @@ def _run(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
 
 
 def _ready(cluster: UpCluster) -> str:
-    budget = listed(
-        f"{amount(size, _UNITS[name])} of {name}" if name != "cpu" else amount(size, "core")
-        for name, size in cluster.hosts[0].budget.items()
-    )
+    shares = cluster.hosts[0].budget
+    budget = listed(_share(name, shares[name]) for name in ("memory", "cpu", "disk") if name in shares)
     each = "each with" if len(cluster.hosts) > 1 else "with"
     names = listed(host.host for host in cluster.hosts)
     return (
         f"ready: {names}, {each} {budget}; {cluster.ros.describe()}\n"
         f"`rosrm ps` in another terminal lists the processes; Ctrl-C here ends everything"
     )
+
+
+def _share(resource: str, size: float) -> str:
+    if resource == "cpu":
+        return f"{size:.3g} {'core' if size == 1.0 else 'cores'}"
+    return f"{amount(size, 'B')} of {resource}"
 
 
 def _submit(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
