@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -60,9 +61,23 @@ def hand_over(settings: str, source: SettingsSource, parent: int = 0) -> int:
     return descriptor
 
 
-def arguments(descriptor: int) -> list[str]:
-    """Return the runtime's command line."""
-    return [_OPTION, str(descriptor)]
+def command_line(module: str, descriptor: int) -> list[str]:
+    """Return the command line of a runtime.
+
+    Args:
+        module: "rosrm.master" or another entry point.
+        descriptor: as returned by `hand_over`.
+    """
+    return [sys.executable, *_without_this_folder(), "-m", module, _OPTION, str(descriptor)]
+
+
+def _without_this_folder() -> list[str]:
+    """Return the option that stops `-m` from searching the working directory first.
+
+    In a checkout that search is needed, so the list is empty.
+    """
+    in_checkout = Path(__file__).is_relative_to(Path.cwd())
+    return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
 
 
 @contextlib.contextmanager
@@ -78,11 +93,11 @@ def interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def take_over(command_line: Sequence[str]) -> Handover:
+def take_over(words: Sequence[str]) -> Handover:
     """Read the input that the command passed; raise `ConfigError` for another command line."""
-    if len(command_line) != 2 or command_line[0] != _OPTION:
+    if len(words) != 2 or words[0] != _OPTION:
         raise ConfigError(f"usage: {_OPTION} N; use `rosrm master` or `rosrm slave` to start one")
-    with os.fdopen(int(command_line[1])) as source:
+    with os.fdopen(int(words[1])) as source:
         handed = json.load(source)
     plugins = tuple(PluginAddress(*address) for address in handed["plugins"])
     return Handover(

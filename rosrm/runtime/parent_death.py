@@ -12,10 +12,13 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 def end_with_parent(parent: int) -> None:
-    """Let the kernel send SIGTERM to this process when its parent ends; the children do not inherit.
+    """Let the kernel send SIGTERM to this process when its parent ends; children are not included.
 
     Args:
         parent: pid of the parent. If it has ended already, this process gets SIGTERM now.
+
+    Raises:
+        OSError: the kernel refuses.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0):

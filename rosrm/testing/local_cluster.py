@@ -13,7 +13,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -27,7 +26,7 @@ from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import HostRow, Listing, ProcessRow
 from rosrm.ros.master_connection import MasterClient
-from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+from rosrm.runtime.bootstrap import command_line, hand_over, interrupts_held
 from rosrm.runtime.settings_check import SettingsSource
 from rosrm.testing.loopback import settings_on_this_machine
 
@@ -145,7 +144,7 @@ class LocalCluster:
         try:
             with log.open("ab") as sink, interrupts_held():
                 process = subprocess.Popen(
-                    [sys.executable, "-m", module, *arguments(holder)],
+                    command_line(module, holder),
                     pass_fds=[holder], stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
                     start_new_session=True,
                 )  # fmt: skip

@@ -19,7 +19,7 @@ import typer
 
 from rosrm.cli.options import CommonOptions, Domain
 from rosrm.cli.output.plain import echo
-from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+from rosrm.runtime.bootstrap import command_line, hand_over, interrupts_held
 from rosrm.runtime.settings_check import SettingsSource
 
 if TYPE_CHECKING:
@@ -114,20 +114,8 @@ def become(module: str, settings: str, source: SettingsSource) -> None:
     descriptor = hand_over(settings, source)
     sys.stdout.flush()
     sys.stderr.flush()
-    interpreter = [sys.executable, *_without_this_folder()]
     with interrupts_held():
-        os.execv(  # noqa: S606 - no shell is wanted
-            sys.executable, [*interpreter, "-m", module, *arguments(descriptor)]
-        )
-
-
-def _without_this_folder() -> list[str]:
-    """Return the option that stops `-m` from searching the working directory first.
-
-    In a checkout that search is needed, so the list is empty.
-    """
-    in_checkout = Path(__file__).is_relative_to(Path.cwd())
-    return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
+        os.execv(sys.executable, command_line(module, descriptor))  # noqa: S606 - no shell is wanted
 
 
 def _source(role: str, file: Path | None, ctx: typer.Context, domain: int | None) -> SettingsSource:

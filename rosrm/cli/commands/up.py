@@ -26,7 +26,7 @@ Discovery = Literal["localhost", "subnet"]
 _MOST_HOSTS: Final = 16
 
 
-def up(  # noqa: PLR0913, PLR0917 - an argument for each option
+def up(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     files: Annotated[
         list[str] | None,
@@ -105,7 +105,7 @@ def _settings(file: Path | None, registry: Registry) -> ClusterConfig:
 
 
 def _local(ros: RosSettings, discovery: Discovery | None) -> RosSettings:
-    """Return ROS settings that keep the traffic on this machine, unless something else is chosen."""
+    """Return ROS settings that keep the traffic on this machine, unless others are chosen."""
     if discovery is not None:
         return replace(ros, discovery_range=discovery)
     joined = {**os.environ, **ros.environment()}

@@ -13,9 +13,8 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Iterable
 from contextlib import suppress
-from glob import escape, glob
+from pathlib import Path
 
 #: Word in the pipe with which the directory stays.
 KEEP = b"keep"
@@ -23,40 +22,28 @@ KEEP = b"keep"
 
 def main() -> None:
     """Wait for the end of `rosrm up`, and clean up."""
-    directory = sys.argv[1]
+    directory = Path(sys.argv[1])
     is_kept = KEEP in sys.stdin.buffer.read()
-    for lock in _locks(directory, "hosts/*/slave.lock"):
-        _wait_until_free(lock)
+    _wait_until_free(*directory.glob("hosts/*/slave.lock"))
     stop_supervisors(directory)
-    for lock in _locks(directory, "master/master.lock"):
-        _wait_until_free(lock)
+    _wait_until_free(*directory.glob("master/master.lock"))
     if not is_kept:
         shutil.rmtree(directory, ignore_errors=True)
 
 
-def stop_supervisors(directory: str) -> None:
+def stop_supervisors(directory: Path) -> None:
     """Stop the supervisors of all hosts with their processes, and wait for their ends."""
-    locks = _locks(directory, "hosts/*/supervisor/supervisor.lock")
+    locks = list(directory.glob("hosts/*/supervisor/supervisor.lock"))
     for lock in locks:
         with suppress(OSError, ValueError):  # it has ended, or has not written its pid yet
             if not _is_free(lock):
-                os.kill(int(_content(lock)), signal.SIGTERM)
-    for lock in locks:
-        _wait_until_free(lock)
+                os.kill(int(lock.read_text()), signal.SIGTERM)
+    _wait_until_free(*locks)
 
 
-def _locks(directory: str, pattern: str) -> Iterable[str]:
-    return sorted(glob(os.path.join(escape(directory), pattern)))
-
-
-def _content(path: str) -> str:
-    with open(path, encoding="ascii") as file:
-        return file.read()
-
-
-def _is_free(path: str) -> bool:
+def _is_free(lock: Path) -> bool:
     """Return True if no process holds a lock."""
-    with open(path, "rb") as file:
+    with lock.open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -64,9 +51,10 @@ def _is_free(path: str) -> bool:
     return True
 
 
-def _wait_until_free(path: str) -> None:
-    with suppress(FileNotFoundError), open(path, "rb") as file:
-        fcntl.flock(file, fcntl.LOCK_SH)
+def _wait_until_free(*locks: Path) -> None:
+    for lock in locks:
+        with lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH)
 
 
 if __name__ == "__main__":

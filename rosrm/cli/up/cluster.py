@@ -77,7 +77,7 @@ class UpCluster(LocalCluster):
             part.end()
         for part in self.slaves.values():
             part.process.wait()
-        cleaner.stop_supervisors(str(self.directory))
+        cleaner.stop_supervisors(self.directory)
         if self.master is not None:
             self.master.end()
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -113,8 +113,8 @@ def _error_of(part: Part) -> RosrmError:
     subject = "the master" if role == "master" else f"the slave of {part.name}"
     last = "".join(f"\n    {line}" for line in lines[-_LINES:])
     return PartEnded(
-        f"{subject} has ended ({_how(part)}). Its log is {part.log}, in a directory that stays; the "
-        f"last lines:{last}"
+        f"{subject} has ended ({_how(part)}). Its log is {part.log}, in a directory that stays; "
+        f"its last lines:{last}"
     )
 
 
@@ -167,4 +167,3 @@ def _claim(directory: Path) -> int:
             f"this one another --state"
         ) from None
     return lock
-

@@ -120,7 +120,9 @@ def _run(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
 
 def _ready(cluster: UpCluster) -> str:
     shares = cluster.hosts[0].budget
-    budget = listed(_share(name, shares[name]) for name in ("memory", "cpu", "disk") if name in shares)
+    budget = listed(
+        _share(name, shares[name]) for name in ("memory", "cpu", "disk") if name in shares
+    )
     each = "each with" if len(cluster.hosts) > 1 else "with"
     names = listed(host.host for host in cluster.hosts)
     return (
