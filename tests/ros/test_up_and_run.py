@@ -20,9 +20,9 @@ from tests.waiting import PATIENCE, wait_until
 WORK = """
 processes:
   - name: "sleeper_{i}"
-    foreach: {i: "range(0, 2)"}
+    foreach: {i: "range(1, 3)"}
     command: sleep 1000
-    labels: {required: {host: "host-{i + 1}"}}
+    labels: {required: {host: "host-{i}"}}
 """
 
 
@@ -32,9 +32,11 @@ def started(terminal: Terminal, *words: str) -> Iterator[tuple[subprocess.Popen,
     work = terminal.file("work.yaml", WORK)
     with terminal.start("up", "--hosts", "2", *words, work, start_new_session=True) as process:
         try:
-            said = read_until(process.stdout.fileno(), "sleeper_0 is ready")
-            if "sleeper_1 is ready" not in said:
-                said += read_until(process.stdout.fileno(), "sleeper_1 is ready")
+            said = ""
+            for ready in ("sleeper_1 is ready", "sleeper_2 is ready"):
+                if ready not in said:
+                    said += read_until(process.stdout.fileno(), ready)
+                assert ready in said, said + process.stderr.read()
             yield process, said
         finally:
             process.kill()  # without effect on one that has ended
@@ -58,7 +60,7 @@ def test_ctrl_c_ends_all_that_up_has_started(terminal, tmp_path) -> None:
         assert "ready: host-1 and host-2, each with " in said
         rows = terminal.json("ps")
         assert {row["name"]: (row["host"], row["state"]) for row in rows} == {
-            "sleeper_0": ("host-1", "running"), "sleeper_1": ("host-2", "running"),
+            "sleeper_1": ("host-1", "running"), "sleeper_2": ("host-2", "running"),
         }  # fmt: skip
         parts = psutil.Process(process.pid).children(recursive=True)
         assert len(parts) == 4  # master, two slaves, cleaner
