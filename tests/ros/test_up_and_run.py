@@ -55,9 +55,15 @@ def terminal(tmp_path) -> Iterator[Terminal]:
 
 
 def test_ctrl_c_ends_all_that_up_has_started(terminal, tmp_path) -> None:
-    """Another process sees hosts and work; after Ctrl-C neither a process nor a file is left."""
+    """Another process sees hosts and work; after Ctrl-C neither a process nor a file is left.
+
+    The parts join ROS with `rosrm up`'s own default, LOCALHOST, and the other process with ROS's.
+    """
+    for name in ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTDDS_BUILTIN_TRANSPORTS"):
+        terminal.environment.pop(name, None)
     with started(terminal) as (process, said):
         assert "ready: host-1 and host-2, each with " in said
+        assert "discovery LOCALHOST" in said
         rows = terminal.json("ps")
         assert {row["name"]: (row["host"], row["state"]) for row in rows} == {
             "sleeper_1": ("host-1", "running"), "sleeper_2": ("host-2", "running"),
