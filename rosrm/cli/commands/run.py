@@ -70,9 +70,10 @@ def run(  # noqa: PLR0913, PLR0917 - an argument for each option
     that of the job, or 128 + the number of the signal that ended it. Standard input is not
     connected. Both output streams of the job arrive on the standard output.
     """
-    from rosrm.cli import one_job
+    from rosrm.cli.job_run import run_job
+    from rosrm.cli.job_spec import job_of, placed
 
-    spec = one_job.job_of(
+    spec = job_of(
         command or [], name=name, needs=pairs_of("--needs", needs or [], "RESOURCE=AMOUNT"),
         environment=pairs_of("--env", env or [], "NAME=VALUE"), time_limit=time_limit,
         directory=directory,
@@ -80,5 +81,4 @@ def run(  # noqa: PLR0913, PLR0917 - an argument for each option
     if any(not word or word.startswith("=") for word in on or []):
         raise ConfigError("--on: give the name of a host, or LABEL=VALUE")
     with connection.master(ctx, domain) as client:
-        placed = one_job.placed(spec, on or [], client.list_hosts())
-        raise typer.Exit(one_job.run(client, placed))
+        raise typer.Exit(run_job(client, placed(spec, on or [], client.list_hosts())))

@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.cli import one_job
+from rosrm.cli import job_run
+from rosrm.cli.job_spec import job_of
+from rosrm.client.client import Client
 from rosrm.model.rows import HostRow
 from rosrm.model.values import HostDescription, Kind
 
@@ -35,7 +37,7 @@ def cluster(client, monkeypatch):
         return "1 process queued"
 
     monkeypatch.setattr(client, "submit", submit)
-    monkeypatch.setattr(one_job._Job, "_read", lambda _job: False)
+    monkeypatch.setattr(job_run._Job, "_read", lambda _job: False)
     return client
 
 
@@ -69,7 +71,7 @@ def test_options_behind_the_program_are_its_own(rosrm, cluster):
 )
 def test_the_default_name_is_the_program_with_a_suffix(program, stem):
     """Two jobs of one program get different names."""
-    names = {one_job.job_of([program], needs={}, environment={}).name for _ in range(20)}
+    names = {job_of([program], needs={}, environment={}).name for _ in range(20)}
     assert all(name.rpartition("-")[0] == stem for name in names)
     assert len(names) > 1
 
@@ -116,6 +118,6 @@ def test_a_host_without_a_label_of_its_own_cannot_be_chosen(rosrm, cluster):
 )  # fmt: skip
 def test_the_exit_code_is_that_of_the_job(client, capsys, end, code, said):
     """A signal gives 128 + its number; a job without an exit code gives 1 and the reason."""
-    job = one_job._Job(one_job.Client(connection=client), "x")
+    job = job_run._Job(Client(connection=client), "x")
     assert job._exit_code(process("x", kind="job", **end)) == code
     assert said in capsys.readouterr().err

@@ -1,14 +1,12 @@
-"""One job of `rosrm run`: its spec, its placement, and its output until it has ended."""
+"""Run of the job of `rosrm run`: submission, output, and the exit code at its end."""
 
 from __future__ import annotations
 
-import secrets
 import signal
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from types import FrameType
 from typing import Final
 
@@ -16,18 +14,14 @@ from rosrm.cli.connection import note
 from rosrm.cli.output.log_lines import LogStream, show
 from rosrm.cli.waiting import show_change
 from rosrm.client.client import Client
-from rosrm.client.connecting import check_name
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
 from rosrm.client.retrying import ask_until_answered
 from rosrm.client.waiting import ENDED
-from rosrm.config.checking import near
-from rosrm.config.documents import Node, Place, node_of
-from rosrm.config.work import checked_work
-from rosrm.errors import ConfigError, NoMaster, Refused
-from rosrm.extensions.registry import Registry
-from rosrm.model.rows import HostRow, ProcessRow
+from rosrm.errors import NoMaster, Refused
+from rosrm.model.rows import ProcessRow
 from rosrm.model.values import ProcessSpec
-from rosrm.wording import printable, standing
+from rosrm.ros.deferred_signals import signals_deferred
+from rosrm.wording import standing
 
 #: Seconds in the queue after which the command says why the job waits.
 _PATIENCE: Final = 1.0
@@ -41,99 +35,7 @@ _FAILED: Final = 1
 _SIGNALLED: Final = 128
 
 
-# --- the spec -----------------------------------------------------------------------------------
-
-
-def job_of(
-    command: Sequence[str], *, name: str = "", needs: Mapping[str, str],
-    environment: Mapping[str, str], time_limit: str = "", directory: str = "",
-) -> ProcessSpec:  # fmt: skip
-    """Return the spec of a job from the words of the command line; raises `ConfigError`.
-
-    The rules of a work file apply; a message names the option instead of a line.
-    """
-    if not command:
-        raise ConfigError("run: no command is given; write it after --: rosrm run -- COMMAND ARG")
-    fields: dict[str, Node] = {
-        "name": node_of(name or _name_of(command[0]), Place("--name", 0, 0)),
-        "kind": node_of("job", Place("run", 0, 0)),
-        "command": node_of(list(command), Place("COMMAND", 0, 0)),
-        "needs": node_of(needs, Place("--needs", 0, 0)),
-        "environment": node_of(environment, Place("--env", 0, 0)),
-    }
-    if time_limit:
-        fields["time_limit"] = node_of(time_limit, Place("--time-limit", 0, 0))
-    if directory:
-        fields["working_directory"] = node_of(directory, Place("--working-directory", 0, 0))
-    place = Place("run", 0, 0)
-    process = Node(fields, place, place)
-    (spec,) = checked_work(
-        Node({"processes": Node((process,), place, place)}, place), "run", registry=None
-    )
-    return spec
-
-
-def _name_of(program: str) -> str:
-    """Return the stem of a program's file with a random suffix, as a name that rosrm allows."""
-    stem = "".join(
-        one if one.isascii() and (one.isalnum() or one in "_-.") else "_"
-        for one in Path(program).stem
-    )
-    return f"{stem.lstrip('-.')[:100] or 'job'}-{secrets.token_hex(2)}"
-
-
-def placed(spec: ProcessSpec, on: Sequence[str], hosts: Sequence[HostRow]) -> ProcessSpec:
-    """Return the spec with the labels that `--on` requires.
-
-    Args:
-        on: names of hosts, or LABEL=VALUE.
-        hosts: of the cluster.
-
-    Raises:
-        ConfigError: a need or a label that no host has.
-        Refused: an unknown host, or one that no label distinguishes from the others.
-    """
-    _check_needs(spec, hosts)
-    required: dict[str, str] = {}
-    for word in on:
-        key, mark, value = word.partition("=")
-        chosen = {key: value} if mark else _label_of(word, hosts)
-        if mark and not any(row.description.labels.get(key) == value for row in hosts):
-            known = sorted({f"{k}={v}" for row in hosts for k, v in row.description.labels.items()})
-            raise ConfigError(f"--on {word}: no host has this label{near(word, known)}")
-        required.update(chosen)
-    return replace(spec, required_labels=required)
-
-
-def _check_needs(spec: ProcessSpec, hosts: Sequence[HostRow]) -> None:
-    """Refuse a resource that neither a host nor an installed probe measures."""
-    measured = {resource.name for row in hosts for resource in row.resources}
-    unknown = [name for name in spec.needs if name not in measured]
-    if unknown:
-        known = sorted(measured.union(Registry.discover().resources()))
-        for name in unknown:
-            if name not in known:
-                raise ConfigError(f"--needs {name}: no probe reads {name!r}{near(name, known)}")
-
-
-def _label_of(name: str, hosts: Sequence[HostRow]) -> Mapping[str, str]:
-    """Return a label that one host has, and no other."""
-    check_name("host", name, [row.description.name for row in hosts])
-    labels = {row.description.name: row.description.labels for row in hosts}
-    others = [item for host, given in labels.items() if host != name for item in given.items()]
-    own = [item for item in labels[name].items() if item not in others]
-    if not own:
-        raise Refused(
-            f"--on {name}: the host has no label of its own, by which a job could require it. "
-            f"Give it one in its host.yaml, for example `labels: {{host: {name}}}`"
-        )
-    return dict(sorted(own, key=lambda item: item[1] != name)[:1])
-
-
-# --- the run ------------------------------------------------------------------------------------
-
-
-def run(client: Client, spec: ProcessSpec) -> int:
+def run_job(client: Client, spec: ProcessSpec) -> int:
     """Submit a job, copy its output until it has ended, and return its exit code.
 
     SIGINT and SIGTERM cancel the job, and then the command waits for its end; a second signal ends
@@ -142,7 +44,9 @@ def run(client: Client, spec: ProcessSpec) -> int:
     job = _Job(client, spec.name)
     with _signals(job):
         try:
-            client.submit(spec)
+            with signals_deferred():
+                client.submit(spec)
+                job.is_queued = True
             return job.follow()
         except BrokenPipeError:  # nothing reads the output any more, as after `| head`
             job.cancel()
@@ -151,7 +55,7 @@ def run(client: Client, spec: ProcessSpec) -> int:
             pass
         try:
             job.cancel()
-            if job.signal != signal.SIGHUP:  # a closed terminal takes no output
+            if job.is_queued and job.signal != signal.SIGHUP:  # a closed terminal takes no output
                 job.follow()
         except KeyboardInterrupt:
             note(
@@ -183,11 +87,13 @@ class _Job:
     """The submitted job.
 
     Attributes:
+        is_queued: the master has accepted the job. Otherwise its name may be another process's.
         signal: number of the signal that interrupted the command; 0: none.
     """
 
     client: Client
     name: str
+    is_queued: bool = False
     signal: int = 0
     _reader: LogReader = field(init=False)
     _begun: bool = False
@@ -201,6 +107,8 @@ class _Job:
 
     def cancel(self) -> None:
         """Cancel the job, unless it has ended or was never queued."""
+        if not self.is_queued:
+            return
         with suppress(Refused):
             self.client.cancel(self.name)
         with suppress(OSError):  # a closed terminal
@@ -259,8 +167,8 @@ class _Job:
         if row.state in _WAITING and time.monotonic() - self._since > _PATIENCE:
             if "waits" not in self._reported:
                 self._reported.add("waits")
-                reason = self.client.explain(self.name)["reason"] or "no reason is known yet"
-                note(f"{self.name} waits for a host: {reason}")
+                story = ask_until_answered(lambda: self.client.explain(self.name), note)
+                note(f"{self.name} waits for a host: {story['reason'] or 'no reason is known yet'}")
         elif row.state in _NOTEWORTHY and row.state not in self._reported:
             self._reported.add(row.state)
             show_change(row)
@@ -280,7 +188,7 @@ class _Job:
         code = row.exit_code or 0
         if not self.signal and row.reason != f"exit code {code}":
             reason = f": {row.reason}" if row.reason else ""
-            note(printable(f"{self.name} {standing(row.state)}{reason}"))
+            note(f"{self.name} {standing(row.state)}{reason}")
         return _SIGNALLED - code if code < 0 else code or _FAILED
 
 
