@@ -175,7 +175,8 @@ def matches(shown: str, given: str) -> bool:
 # --- a reader ---------------------------------------------------------------------------------
 
 #: What keeps its terminal until Ctrl-C.
-_STAYS: Final = re.compile(r"(.* )?rosrm (--\S+ \S+ )?(master|slave|events -f)\b")
+_STAYS: Final = re.compile(r"(.* )?rosrm (--\S+ \S+ )?(up|master|slave|events -f)\b")
+_HOSTS: Final = re.compile(r"rosrm up\b(?:.* --hosts (\d+))?")
 
 
 @dataclass
@@ -266,7 +267,7 @@ class Reader:
             time.sleep(0.5)
 
     def _open(self, line: str) -> None:
-        """Start what stays, and wait until a slave is up."""
+        """Start what stays, and wait until its hosts are up."""
         log = self.folder / f"terminal-{len(self.terminals)}.log"
         with log.open("wb") as sink:
             process = subprocess.Popen(
@@ -278,7 +279,13 @@ class Reader:
             # Of the pages' hosts the first to be started is the first to be given work.
             before = line.partition("rosrm slave")[0]
             slaves = sum("rosrm slave" in one for one, _, _ in self.terminals)
-            self._ask(f"test $({before}rosrm hosts | grep -cw up) -ge {slaves}", "", whole=True)
+            self._await_hosts(before, slaves)
+        elif up := _HOSTS.match(line):
+            self._await_hosts("", int(up[1] or 1))
+
+    def _await_hosts(self, before: str, count: int) -> None:
+        """Wait until some hosts are up; `before` stands before the command of the page."""
+        self._ask(f"test $({before}rosrm hosts | grep -cw up) -ge {count}", "", whole=True)
 
     def _await(self, text: str) -> None:
         line, process, log = self.terminals[-1]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Commands that send requests to the master.
 ASKING: Final = frozenset({
-    "submit", "cancel", "restart", "migrate", "checkpoint", "restore", "prune", "cordon",
+    "submit", "run", "cancel", "restart", "migrate", "checkpoint", "restore", "prune", "cordon",
     "uncordon", "drain", "rebalance", "reload", "status", "ps", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip

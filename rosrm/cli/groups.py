@@ -17,7 +17,7 @@ _ELSEWHERE: Final = {
     for verbs, words in (
         (("cancel", "restart"), "stop"),
         (("cancel",), "kill delete del remove rm abort terminate down destroy"),
-        (("submit",), "run launch add create apply up deploy queue enqueue"),
+        (("submit",), "launch add create apply deploy queue enqueue"),
         (("submit", "restart"), "start"),
         (("restart",), "reload"),
         (("ps",), "list ls processes jobs services get"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -45,3 +46,23 @@ def seconds_of(
         return Quantity("duration", low=low, above=above).parse(text)
     except ValueError as error:
         raise ConfigError(f"{option}: {error}{hint}") from None
+
+
+def pairs_of(option: str, words: Iterable[str], form: str) -> dict[str, str]:
+    """Return the values of a repeated option by their names; the last of a name counts.
+
+    Args:
+        option: name of the option, for messages.
+        words: "NAME=VALUE" each.
+        form: form of a word, for messages.
+
+    Raises:
+        ConfigError: a word has another form.
+    """
+    pairs = {}
+    for word in words:
+        name, mark, value = word.partition("=")
+        if not (name and mark):
+            raise ConfigError(f"{option} {word}: give {form}")
+        pairs[name] = value
+    return pairs

@@ -103,10 +103,12 @@ class Problems:
         lines = list(_allowed_once(f"{place}: {text}" for place, text in sorted(self.found)))
         if len(lines) == 1:
             raise ConfigError(lines[0])
-        raise ConfigError("\n  ".join([f"{len(lines)} errors in {self._file()}", *lines]))
+        raise ConfigError("\n  ".join([f"{len(lines)} errors{self._in_file()}", *lines]))
 
-    def _file(self) -> str:
-        return next(iter(self.found))[0].file
+    def _in_file(self) -> str:
+        """Return the file of all problems; "": they are in several options of a command line."""
+        files = {place.file for place, _ in self.found}
+        return f" in {files.pop()}" if len(files) == 1 else ""
 
 
 def _allowed_once(lines: Iterable[str]) -> Iterator[str]:

@@ -255,6 +255,11 @@ class MasterClient:
             raise
         return cls(endpoints, hello, name, max(timeout, _REQUEST))
 
+    @property
+    def master_pid(self) -> int:
+        """Return the pid of the master, on the master's machine."""
+        return int(self._master.pid)
+
     # --- requests ------------------------------------------------------------------------
 
     def submit(self, specs: Sequence[ProcessSpec]) -> str:

@@ -13,6 +13,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
+from pathlib import Path
 from types import FrameType
 from typing import Final
 
@@ -33,31 +34,50 @@ class Handover:
         settings: JSON of `ClusterConfig` or `HostConfig`.
         plugins: every installed plugin.
         source: origin of the settings, for a reload.
+        parent: pid of the process with which the runtime ends; 0: none.
     """
 
     settings: str
     plugins: tuple[PluginAddress, ...]
     source: SettingsSource
+    parent: int = 0
 
 
-def hand_over(settings: str, source: SettingsSource) -> int:
+def hand_over(settings: str, source: SettingsSource, parent: int = 0) -> int:
     """Write the input of a runtime; return the file descriptor that the runtime is to inherit.
 
     Args:
         settings: JSON of the checked settings.
         source: origin of the settings.
+        parent: pid of the parent, if the runtime ends with its parent; 0: it does not.
     """
     plugins = [[one.name, one.target, one.distribution] for one in installed_plugins()]
     descriptor = os.memfd_create("rosrm-settings", 0)
-    handed = {"settings": settings, "plugins": plugins, "source": astuple(source)}
+    handed = {
+        "settings": settings, "plugins": plugins, "source": astuple(source), "parent": parent,
+    }  # fmt: skip
     os.write(descriptor, json.dumps(handed).encode())
     os.lseek(descriptor, 0, os.SEEK_SET)
     return descriptor
 
 
-def arguments(descriptor: int) -> list[str]:
-    """Return the runtime's command line."""
-    return [_OPTION, str(descriptor)]
+def command_line(module: str, descriptor: int) -> list[str]:
+    """Return the command line of a runtime.
+
+    Args:
+        module: "rosrm.master" or another entry point.
+        descriptor: as returned by `hand_over`.
+    """
+    return [sys.executable, *_without_this_folder(), "-m", module, _OPTION, str(descriptor)]
+
+
+def _without_this_folder() -> list[str]:
+    """Return the option that stops `-m` from searching the working directory first.
+
+    In a checkout that search is needed, so the list is empty.
+    """
+    in_checkout = Path(__file__).is_relative_to(Path.cwd())
+    return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
 
 
 @contextlib.contextmanager
@@ -73,14 +93,16 @@ def interrupts_held() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def take_over(command_line: Sequence[str]) -> Handover:
+def take_over(words: Sequence[str]) -> Handover:
     """Read the input that the command passed; raise `ConfigError` for another command line."""
-    if len(command_line) != 2 or command_line[0] != _OPTION:
+    if len(words) != 2 or words[0] != _OPTION:
         raise ConfigError(f"usage: {_OPTION} N; use `rosrm master` or `rosrm slave` to start one")
-    with os.fdopen(int(command_line[1])) as source:
+    with os.fdopen(int(words[1])) as source:
         handed = json.load(source)
     plugins = tuple(PluginAddress(*address) for address in handed["plugins"])
-    return Handover(handed["settings"], plugins, SettingsSource(*handed["source"]))
+    return Handover(
+        handed["settings"], plugins, SettingsSource(*handed["source"]), handed["parent"]
+    )
 
 
 _Handler = Callable[[int, FrameType | None], None]
@@ -139,7 +161,12 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
     output.setFormatter(LogFormatter("%(asctime)s %(name)s: %(message)s", "%H:%M:%S"))
     logging.basicConfig(level=logging.INFO, handlers=[output])
     try:
-        return serve(take_over(sys.argv[1:]))
+        handover = take_over(sys.argv[1:])
+        if handover.parent:
+            from rosrm.runtime.parent_death import end_with_parent  # noqa: PLC0415 - ctypes
+
+            end_with_parent(handover.parent)
+        return serve(handover)
     except RosrmError as error:
         sys.stderr.write(printable(f"rosrm {role}: {error}\n"))
         return error.exit_code

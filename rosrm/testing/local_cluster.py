@@ -1,4 +1,4 @@
-"""Complete cluster on this machine for demos, tests and benchmarks.
+"""Complete cluster on this machine for `rosrm up`, demos, tests and benchmarks.
 
 Master, slaves and processes are real. Every part is a process of its own, started as by
 `rosrm master` and `rosrm slave`, in a separate ROS domain on loopback. At the end of the `with`
@@ -13,7 +13,6 @@ import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -24,9 +23,10 @@ import psutil
 
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import NoMaster, RosrmError
+from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import HostRow, Listing, ProcessRow
 from rosrm.ros.master_connection import MasterClient
-from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+from rosrm.runtime.bootstrap import command_line, hand_over, interrupts_held
 from rosrm.runtime.settings_check import SettingsSource
 from rosrm.testing.loopback import settings_on_this_machine
 
@@ -93,8 +93,10 @@ class LocalCluster:
         directory: for state directories and logs.
         cluster: the master's settings; this class replaces their `ros` and `state`.
         hosts: the slaves' settings; likewise.
-        domain: ROS domain; None: a free one.
+        domain: ROS domain; None: a free one, or that of `joining`.
         files: name of a part to the file from which it reloads its settings.
+        joining: ROS settings of all parts; None: those that keep the traffic on this machine.
+        ends_with_starter: True: the parts stop when this process ends, also if it is killed.
     """
 
     directory: Path
@@ -102,6 +104,8 @@ class LocalCluster:
     hosts: Sequence[HostConfig] = ()
     domain: int | None = None
     files: dict[str, Path] = field(default_factory=dict)
+    joining: RosSettings | None = None
+    ends_with_starter: bool = False
     master: Part | None = None
     slaves: dict[str, Part] = field(default_factory=dict)
     _client: MasterClient | None = None
@@ -111,9 +115,9 @@ class LocalCluster:
         """Choose the domain."""
         # An absolute path, because processes with other working directories get file names in it.
         self.directory = self.directory.absolute()
-        if self.domain is None:
+        if self.domain is None and self.joining is None:
             self.domain, self._claim = claim_domain()
-        self.ros = settings_on_this_machine(self.domain)
+        self.ros = self.joining or settings_on_this_machine(self.domain)
 
     # --- parts ---------------------------------------------------------------------------
 
@@ -135,11 +139,12 @@ class LocalCluster:
         self.directory.mkdir(parents=True, exist_ok=True)
         log = self.directory / f"{name}.log"
         role, path = module.removeprefix("rosrm."), str(self.files.get(name, ""))
-        holder = hand_over(settings, SettingsSource(role, path))
+        parent = os.getpid() if self.ends_with_starter else 0
+        holder = hand_over(settings, SettingsSource(role, path), parent)
         try:
             with log.open("ab") as sink, interrupts_held():
                 process = subprocess.Popen(
-                    [sys.executable, "-m", module, *arguments(holder)],
+                    command_line(module, holder),
                     pass_fds=[holder], stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
                     start_new_session=True,
                 )  # fmt: skip
@@ -153,7 +158,8 @@ class LocalCluster:
         Returns:
             Unix time of the failure.
         """
-        pids = {host: part.process.pid for host, part in self.slaves.items()}
+        running = [item for item in self.slaves.items() if item[1].process.poll() is None]
+        pids = {host: part.process.pid for host, part in running}
         slave = self.slaves.pop(name).process
         at = time.time()
         stopped: set[int] = set()

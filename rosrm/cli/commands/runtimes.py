@@ -19,7 +19,7 @@ import typer
 
 from rosrm.cli.options import CommonOptions, Domain
 from rosrm.cli.output.plain import echo
-from rosrm.runtime.bootstrap import arguments, hand_over, interrupts_held
+from rosrm.runtime.bootstrap import command_line, hand_over, interrupts_held
 from rosrm.runtime.settings_check import SettingsSource
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def master(
     registry = Registry.discover()
     file = config or ctx.ensure_object(CommonOptions).cluster
     settings = load_cluster(file, registry) if file else default_cluster(registry)
-    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    settings = replace(settings, ros=with_domain(settings.ros, ctx, domain))
     if recover:
         echo(_recover(settings.state), err=True)
     with only_one(settings.state, "master", code="second_master", remedy="another `state:`"):
@@ -92,7 +92,7 @@ def slave(
 
     registry = Registry.discover()
     settings = load_host(config, registry) if config else HostConfig()
-    settings = replace(settings, ros=_with_domain(settings.ros, ctx, domain))
+    settings = replace(settings, ros=with_domain(settings.ros, ctx, domain))
     if stop_everything:
         if not (settings.state / "supervisor").is_dir():
             echo(f"nothing to stop: no slave was started with the state directory {settings.state}")
@@ -114,20 +114,8 @@ def become(module: str, settings: str, source: SettingsSource) -> None:
     descriptor = hand_over(settings, source)
     sys.stdout.flush()
     sys.stderr.flush()
-    interpreter = [sys.executable, *_without_this_folder()]
     with interrupts_held():
-        os.execv(  # noqa: S606 - no shell is wanted
-            sys.executable, [*interpreter, "-m", module, *arguments(descriptor)]
-        )
-
-
-def _without_this_folder() -> list[str]:
-    """Return the option that stops `-m` from searching the working directory first.
-
-    In a checkout that search is needed, so the list is empty.
-    """
-    in_checkout = Path(__file__).is_relative_to(Path.cwd())
-    return ["-P"] if sys.version_info >= (3, 11) and not in_checkout else []
+        os.execv(sys.executable, command_line(module, descriptor))  # noqa: S606 - no shell is wanted
 
 
 def _source(role: str, file: Path | None, ctx: typer.Context, domain: int | None) -> SettingsSource:
@@ -139,7 +127,8 @@ def _chosen_domain(ctx: typer.Context, domain: int | None) -> int | None:
     return ctx.ensure_object(CommonOptions).domain if domain is None else domain
 
 
-def _with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+def with_domain(settings: RosSettings, ctx: typer.Context, domain: int | None) -> RosSettings:
+    """Return checked ROS settings, with the domain of the command line if it names one."""
     from rosrm.ros.network_interface import check_interface
 
     chosen = _chosen_domain(ctx, domain)

@@ -1,0 +1,169 @@
+"""Start and end of the cluster of `rosrm up`."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from rosrm.cli.up import cleaner
+from rosrm.errors import ConfigError, Refused, RosrmError
+from rosrm.model.rows import Listing
+from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.testing.local_cluster import LocalCluster, Part
+
+#: Seconds for all hosts to register.
+_REGISTER: Final = 30.0
+#: Seconds for the master to end after SIGINT, when no slave is left.
+_END: Final = 10.0
+#: Lines of a log that an error shows.
+_LINES: Final = 10
+
+
+class PartEnded(RosrmError):
+    """The master or a slave has ended without a request of `rosrm up`; its log may help."""
+
+
+class UpCluster(LocalCluster):
+    """Master and slaves in one directory, which end with this process."""
+
+    def start(self) -> None:
+        """Start the master, then the slaves, and wait until all hosts are up.
+
+        Raises:
+            RosrmError: a part was refused, for example because the domain has a master already.
+        """
+        master = self.start_master()
+        if self.client.master_pid != master.process.pid:
+            self._wait_for_refusal(master)
+        for host in self.hosts:
+            self.start_slave(host)
+        try:
+            self.wait_until("all hosts up", self._all_up, _REGISTER)
+        except TimeoutError as error:
+            raise RosrmError(f"{error}. The logs are in {self.directory}") from None
+
+    def _all_up(self, view: Listing) -> bool:
+        return {row.description.name for row in view.hosts if row.state == "up"} >= set(self.slaves)
+
+    def _wait_for_refusal(self, master: Part) -> None:
+        """Raise the error of a master that ends, because another master has the domain."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            master.process.wait(_END)
+        self.check_parts()
+        raise RosrmError(f"another master answers on {self.ros.describe()}. Stop it first")
+
+    def check_parts(self) -> None:
+        """Raise the error of a part that has ended."""
+        for part in (self.master, *self.slaves.values()):
+            if part is not None and part.process.poll() is not None:
+                raise _error_of(part)
+
+    _check_parts = check_parts
+
+    def end(self) -> None:
+        """Stop the slaves with their processes, supervisors that a slave has left, and the master.
+
+        Each slave limits the time in which its processes stop.
+        """
+        self._leave()
+        for part in self.slaves.values():
+            part.end()
+        for part in self.slaves.values():
+            part.process.wait()
+        cleaner.stop_supervisors(self.directory)
+        if self.master is not None:
+            self.master.end()
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.master.process.wait(_END)
+            self._kill_master()
+
+    def kill(self) -> None:
+        """Kill the slaves, the supervisors, all processes and the master."""
+        self._leave()
+        for name in list(self.slaves):
+            self.switch_off(name)
+        self._kill_master()
+
+    def _leave(self) -> None:
+        if self._client is not None:
+            self._client.close()
+            self._client = None
+
+    def _kill_master(self) -> None:
+        if self.master is not None:
+            self.master.end(signal.SIGKILL)
+            self.master.process.wait()
+
+
+def _error_of(part: Part) -> RosrmError:
+    """Return the error of a part that has ended: its own message, or how it ended and its log."""
+    role = "master" if part.name == "master" else "slave"
+    lines = part.log.read_text(encoding="utf-8", errors="replace").splitlines()
+    own = f"rosrm {role}: "
+    for at, line in enumerate(lines):
+        if line.startswith(own):
+            return RosrmError("\n".join([line.removeprefix(own), *lines[at + 1 :]]))
+    subject = "the master" if role == "master" else f"the slave of {part.name}"
+    last = "".join(f"\n    {line}" for line in lines[-_LINES:])
+    return PartEnded(
+        f"{subject} has ended ({_how(part)}). Its log is {part.log}, in a directory that stays; "
+        f"its last lines:{last}"
+    )
+
+
+def _how(part: Part) -> str:
+    code = part.process.returncode
+    return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
+
+
+@contextlib.contextmanager
+def cleaned(directory: Path, *, keep: bool) -> Iterator[None]:
+    """Claim a directory for one `rosrm up`; remove it at the end, also of a killed process.
+
+    Args:
+        directory: created if it is missing.
+        keep: True: the directory stays; it stays, too, if a part has ended.
+
+    Raises:
+        Refused: another `rosrm up` uses the directory.
+    """
+    lock = _claim(directory)
+    with subprocess.Popen(
+        [sys.executable, "-I", "-S", cleaner.__file__, str(directory)],
+        stdin=subprocess.PIPE, pass_fds=[lock], start_new_session=True,
+    ) as process:  # fmt: skip
+        os.close(lock)  # the cleaner holds the lock
+        assert process.stdin is not None
+        if keep:
+            process.stdin.write(cleaner.KEEP)
+            process.stdin.flush()
+        try:
+            yield
+        except PartEnded:
+            process.stdin.write(cleaner.KEEP)
+            raise
+
+
+def _claim(directory: Path) -> int:
+    """Return the descriptor of the lock of a directory."""
+    try:
+        make_private_directory(directory)
+        lock = open_private(str(directory / "up.lock"), os.O_RDWR | os.O_CREAT)
+    except OSError as error:
+        raise ConfigError(f"--state {directory} cannot be used: {error.strerror}") from None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise Refused(
+            f"another `rosrm up` runs on {directory}, or is still ending. Stop it first, or give "
+            f"this one another --state"
+        ) from None
+    return lock

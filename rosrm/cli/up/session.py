@@ -1,0 +1,170 @@
+"""Run of `rosrm up`: start, submission, one line for each event that matters, end."""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from types import FrameType
+from typing import TYPE_CHECKING, Final
+
+import typer
+
+from rosrm.cli.output.plain import echo
+from rosrm.cli.output.tables import event_line
+from rosrm.cli.process import INTERRUPTED
+from rosrm.cli.up.cluster import UpCluster
+from rosrm.client.waiting import ENDED
+from rosrm.errors import NoMaster, RosrmError
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.rows import EventRow
+from rosrm.model.values import ProcessSpec
+from rosrm.wording import amount, counted, first_line, listed
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+#: Seconds between two polls of events and parts.
+_PERIOD: Final = 0.3
+#: Number of events in one listing that leaves out none, as in `List.srv`.
+_ALL_NEW: Final = 2**32 - 1
+#: Kinds of events that are shown: starts and ends of processes, moves, and problems.
+_SHOWN: Final = frozenset({
+    EventKind.READY, EventKind.RUNNING, EventKind.REACHABLE, EventKind.BACKOFF, EventKind.FINISHED,
+    EventKind.FAILED, EventKind.CANCELLED, EventKind.OVERDUE, EventKind.WAITS, EventKind.SET_ASIDE,
+    EventKind.FENCED, EventKind.GIVEN_UP, EventKind.SEPARATED, EventKind.PREEMPTED,
+    EventKind.HOST_REFUSED, EventKind.HOST_SUSPECT, EventKind.HOST_BACK, EventKind.HOST_LOST,
+    EventKind.HOST_LEFT, EventKind.HOST_DETACHED, EventKind.READING_REFUSED, EventKind.OVER_LIMIT,
+    EventKind.UNDER_LIMIT, EventKind.NOTHING_MOVES, EventKind.DEVICE_MISSING,
+    EventKind.DEVICE_FOUND, EventKind.MIGRATION_STUCK, EventKind.MIGRATED, EventKind.STAYED,
+    EventKind.FAILED_OVER, EventKind.STANDBY_READY, EventKind.STANDBY_LOST, EventKind.CHECKPOINTED,
+    EventKind.CHECKPOINT_FAILED, EventKind.RESTORED, EventKind.RESTORE_FAILED,
+    EventKind.PEER_REFUSED, EventKind.JOURNAL_BACK, EventKind.JOURNAL_BEHIND,
+    EventKind.SETTINGS_RELOADED, EventKind.RELOAD_REFUSED, EventKind.PLUGIN_FAILED,
+    EventKind.PLUGIN_WORKS,
+})  # fmt: skip
+
+
+class _Stopped(BaseException):
+    """A signal asks for the end of the cluster."""
+
+
+class _Hurried(BaseException):
+    """A second signal asks for the end at once."""
+
+
+def serve(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
+    """Start a cluster, submit processes, and show events until a signal; then end the cluster.
+
+    Raises:
+        typer.Exit: a second signal has killed the cluster.
+        RosrmError: a part was refused or has ended, or the processes were refused.
+    """
+    with _Signals() as signals:
+        try:
+            try:
+                _run(cluster, specs)
+            except _Stopped:
+                _say("ending: the processes stop first; Ctrl-C again kills everything at once")
+            except RosrmError as error:
+                _say(f"ending everything: {first_line(str(error))}")
+                raise
+            finally:
+                signals.hurry_next()
+                cluster.end()
+        except _Hurried:
+            cluster.kill()
+            _say("killed all processes, and every part of rosrm")
+            raise typer.Exit(INTERRUPTED) from None
+    _say("ended; nothing runs any more")
+
+
+class _Signals:
+    """Turns a first signal into `_Stopped`, a further one into `_Hurried`, and ignores others."""
+
+    def __init__(self) -> None:
+        self._next: list[type[BaseException]] = [_Stopped, _Hurried]
+
+    def __enter__(self) -> Self:
+        ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        self._before = {number: signal.signal(number, self._handle) for number in ending}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def hurry_next(self) -> None:
+        """Turn the next signal into `_Hurried`, because the end has begun."""
+        self._next = [one for one in self._next if one is not _Stopped]
+
+    def _handle(self, _number: int, _frame: FrameType | None) -> None:
+        if self._next:
+            raise self._next.pop(0)
+
+
+def _run(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
+    cluster.start()
+    _say(_ready(cluster))
+    after = cluster.client.list().last_sequence
+    _submit(cluster, specs)
+    while True:
+        cluster.check_parts()
+        for event in _new_events(cluster, after):
+            after = event.sequence
+            if event.kind in _SHOWN:
+                _print(event_line(event))
+        cluster.client.spin(_PERIOD)
+
+
+def _ready(cluster: UpCluster) -> str:
+    shares = cluster.hosts[0].budget
+    budget = listed(
+        _share(name, shares[name]) for name in ("memory", "cpu", "disk") if name in shares
+    )
+    each = "each with" if len(cluster.hosts) > 1 else "with"
+    names = listed(host.host for host in cluster.hosts)
+    return (
+        f"ready: {names}, {each} {budget}; {cluster.ros.describe()}\n"
+        f"`rosrm ps` in another terminal lists the processes; Ctrl-C here ends everything"
+    )
+
+
+def _share(resource: str, size: float) -> str:
+    if resource == "cpu":
+        return f"{size:.3g} {'core' if size == 1.0 else 'cores'}"
+    return f"{amount(size, 'B')} of {resource}"
+
+
+def _submit(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
+    """Submit processes, except those that a kept state directory has already."""
+    if not specs:
+        return
+    rows = cluster.client.list(processes=True).processes
+    known = {row.name for row in rows if row.state not in ENDED}
+    new = [spec for spec in specs if spec.name not in known]
+    if len(new) < len(specs):
+        _say(f"{counted(len(specs) - len(new), 'process', 'processes')} queued or running already")
+    if new:
+        _say(cluster.client.submit(new))
+
+
+def _new_events(cluster: UpCluster, after: int) -> Sequence[EventRow]:
+    try:
+        return cluster.client.list(events=True, after=after, newest=_ALL_NEW).events
+    except NoMaster as error:
+        cluster.check_parts()  # the error of a master that has ended says more
+        _say(str(error))
+        return ()
+
+
+def _say(text: str) -> None:
+    """Print a line of this command with the time, as a line of an event has it."""
+    now = time.strftime("%H:%M:%S")
+    _print(f"{now}  " + text.replace("\n", f"\n{'':{len(now) + 2}}"))
+
+
+def _print(text: str) -> None:
+    with suppress(OSError):  # a closed terminal must not prevent the end
+        echo(text)
