@@ -43,7 +43,7 @@ class Schedule:
     on: tuple[str, ...] = ()
 
     def __bool__(self) -> bool:
-        """Return True if the job starts again by itself."""
+        """Return True if the job starts again without a request."""
         return bool(self.every or self.at)
 
     @property

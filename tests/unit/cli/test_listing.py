@@ -175,7 +175,8 @@ def test_ps_json_has_every_process_with_every_field(rosrm, client):
         "name": "talker", "kind": "service", "state": "running", "host": "alpha", "number": 1,
         "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
         "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
-        "stale": False, "owner": "", "cpu_limit": 0.0, "memory_limit": 0,
+        "stale": False, "owner": "", "cpu_limit": 0.0, "memory_limit": 0, "array": "",
+        "next_run": 0.0,
     }  # fmt: skip
 
 

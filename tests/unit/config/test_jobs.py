@@ -142,6 +142,6 @@ def test_the_job_of_an_array_that_is_a_node_has_the_index_in_its_name(refusal):
 
 @pytest.mark.parametrize("key", ["array: 1-2", "parallel: 2"])
 def test_an_array_is_no_default(refusal, key):
-    """It belongs to one entry."""
+    """Each entry has its own."""
     said = refusal(load_work, f"{{defaults: {{{key}}}, processes: [{{name: p, command: x}}]}}")
     assert f"{key.partition(':')[0]} is allowed in a process only" in said

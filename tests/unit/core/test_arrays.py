@@ -67,7 +67,7 @@ def test_a_job_that_waits_for_a_host_has_a_place() -> None:
 
 
 def test_a_waiting_job_can_be_cancelled_and_submitted_again() -> None:
-    """It then waits behind the others."""
+    """The new one waits behind the others."""
     cluster = Cluster("a").with_processes(*array(4, 1))
     cluster.cancel("r-2")
     assert cluster.phase("r-2") == "cancelled"
