@@ -171,8 +171,8 @@ if TYPE_CHECKING:
 
 # Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
-    "PROTOCOL_VERSION", "Accounting", "Amount", "ArrayMembership", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
-    "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
+    "PROTOCOL_VERSION", "Accounting", "Amount", "ArrayMembership", "AwaitReady", "AwaitReleased",
+    "BoolArray", "Bytes", "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
@@ -186,8 +186,8 @@ __all__ = [
     "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
     "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
-    "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
-    "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
+    "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions",
+    "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
     "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
