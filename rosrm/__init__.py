@@ -25,7 +25,7 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
                 HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
-                ReschedulePolicy
+                ReschedulePolicy, ArrayMembership, Schedule
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device
@@ -122,6 +122,7 @@ if TYPE_CHECKING:
         ResourceName,
         Seconds,
     )
+    from rosrm.model.arrays import ArrayMembership
     from rosrm.model.devices import Device, DeviceNeed
     from rosrm.model.plan import (
         AwaitReady,
@@ -147,6 +148,7 @@ if TYPE_CHECKING:
         ProcessRow,
         ResourceRow,
     )
+    from rosrm.model.schedules import Schedule
     from rosrm.model.values import (
         Accounting,
         Health,
@@ -169,8 +171,8 @@ if TYPE_CHECKING:
 
 # Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
-    "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
-    "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
+    "PROTOCOL_VERSION", "Accounting", "Amount", "ArrayMembership", "AwaitReady", "AwaitReleased",
+    "BoolArray", "Bytes", "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
@@ -184,8 +186,8 @@ __all__ = [
     "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
     "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
-    "RosrmError", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions", "SetRestart",
-    "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
+    "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions",
+    "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
     "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
@@ -210,6 +212,7 @@ _NAMES: Final = {
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
+    "model.arrays": "ArrayMembership",
     "model.devices": "Device DeviceNeed",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
@@ -217,6 +220,7 @@ _NAMES: Final = {
     ),
     "model.ros_settings": "RosSettings",
     "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
+    "model.schedules": "Schedule",
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
         "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "

@@ -13,7 +13,9 @@ _BINARY_SIZES: Final = ("B", "KiB", "MiB", "GiB", "TiB", "PiB")
 #: Highest number of names with which a misspelt name is compared, because the master's loop waits.
 MOST_COMPARED: Final = 1000
 #: Commands that list the names of a kind.
-_LISTED_BY: Final = {"process": "rosrm ps --all", "host": "rosrm hosts"}
+_LISTED_BY: Final = {
+    "process": "rosrm ps --all", "host": "rosrm hosts", "array": "rosrm ps --all --json",
+}  # fmt: skip
 _STANDING: Final = {
     "backoff": "is in back-off",
     "failed": "has failed",

@@ -9,10 +9,12 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 
 from hypothesis import strategies as st
 
+from rosrm.model.arrays import NO_ARRAY
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
-from rosrm.model.values import Enforcement, Limits, NeighbourRule, ProcessSpec, Realtime
+from rosrm.model.schedules import NO_SCHEDULE, WEEKDAYS, Schedule
+from rosrm.model.values import Enforcement, Kind, Limits, NeighbourRule, ProcessSpec, Realtime
 
 Drawn = st.SearchStrategy[Any]
 
@@ -44,12 +46,22 @@ _DEVICES: Final = st.builds(
     Device, PROPER_NAMES, PROPER_NAMES, PRINTABLE.map(lambda text: f"/{text}"),
     st.integers(1, 1000), PRINTABLE, PRINTABLE,
 )  # fmt: skip
+_TIMES: Final = st.lists(st.sampled_from(["02:00", "2:00 UTC", "23:59 Etc/UTC"]), min_size=1)
+_SCHEDULES: Final = st.one_of(
+    st.just(NO_SCHEDULE),
+    st.builds(Schedule, every=st.floats(1.0, LONGEST)),
+    st.builds(
+        Schedule, at=_TIMES.map(tuple),
+        on=st.lists(st.sampled_from(WEEKDAYS), max_size=7, unique=True).map(tuple),
+    ),
+)  # fmt: skip
 _BY_TYPE: Final[Mapping[Any, Drawn]] = {
     str: WORDS,
     int: st.integers(0, 2**31 - 1),
     float: st.floats(0.0, 3e8),
     str | None: st.none() | NAMES,
     Any: _PLAIN,
+    Schedule: _SCHEDULES,
     HeldDevice: st.builds(HeldDevice, PROPER_NAMES, PROPER_NAMES, _SHARES),
     tuple[DeviceNeed, ...]: st.lists(_ASKED, max_size=3, unique_by=lambda one: one.kind).map(tuple),
     tuple[Device, ...]: st.lists(
@@ -139,9 +151,17 @@ def _scheduling(spec: ProcessSpec) -> dict[str, Any]:
     return {"realtime": replace(spec.realtime, priority=priority), "limits": limits, "nice": 0}
 
 
+def _for_jobs(spec: ProcessSpec) -> dict[str, Any]:
+    """Return the fields that only jobs have."""
+    is_job = spec.kind is Kind.JOB
+    return {} if is_job else {"array": NO_ARRAY, "schedule": NO_SCHEDULE}
+
+
 #: Specs with one program, as a master accepts them.
 SPECS: Final = st.builds(
-    lambda spec, program: replace(spec, **{**_NO_PROGRAM, **program, **_scheduling(spec)}),
+    lambda spec, program: replace(
+        spec, **{**_NO_PROGRAM, **program, **_scheduling(spec), **_for_jobs(spec)}
+    ),
     drawn(ProcessSpec, neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple)),
     _PROGRAMS,
 )

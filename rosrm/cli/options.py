@@ -35,6 +35,9 @@ Domain = Annotated[
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a process.")]
 Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of processes.")]
+Array = Annotated[
+    str, typer.Option("--array", metavar="NAME", help="Only jobs of this array, e.g. render.")
+]
 Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host.")]
 
 

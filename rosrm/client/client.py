@@ -290,7 +290,8 @@ class Client:
 
         Args:
             processes: by their names.
-            until: "settled": each job has ended and each service runs. "ended": each process has
+            until: "settled": each job has ended, or waits for the next run of its schedule after a
+                run without a failure, and each service runs. "ended": each process has
                 ended, whatever the cause.
             timeout: seconds; None: no limit.
             previous: after a restart: the rows of `list_processes` from before; each process is

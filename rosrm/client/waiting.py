@@ -126,6 +126,8 @@ def _judge(
         return "done" if row.state in ENDED else "awaited"
     if row.state in UNTIL_ASKED:
         return "failed"
+    if row.state == "scheduled":  # between two runs
+        return "failed" if row.exit_code else "done"
     if row.state == "finished":  # a service that has finished is not started again
         return "done" if row.kind == "job" else "failed"
     if row.state != "running":

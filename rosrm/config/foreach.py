@@ -6,6 +6,9 @@
 In every text of the entry `{i}` is replaced by the value, and `{i:02d}` by the value in Python's
 format. A text that consists of `{i}` alone becomes the value itself, number or text. `{{` is a
 plain brace. `{device.camera}` stays for the host that runs the process.
+
+`array: 1-100` expands an entry in the same way, with `{array.index}` as its value, also beside
+`foreach`.
 """
 
 from __future__ import annotations
@@ -16,8 +19,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
+from rosrm.config.arrays import as_member, checked_indexes
 from rosrm.config.checking import described, near
 from rosrm.config.documents import Node, Problems
+from rosrm.model.arrays import INDEX
 from rosrm.model.devices import PLACEHOLDER
 
 #: Highest number of processes to which one entry may expand.
@@ -31,22 +36,39 @@ _RANGE: Final = re.compile(
 )
 _PIECE: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
 _TOO_WIDE: Final = re.compile(r"\d{4}")
-_WHOLE: Final = re.compile(r"\{([A-Za-z_]\w*)\}")
+_WHOLE: Final = re.compile(rf"\{{([A-Za-z_]\w*|{re.escape(INDEX)})\}}")
 
 
 def expanded(entry: Node, problems: Problems) -> Iterator[Node]:
-    """Yield the entry itself or, with `foreach`, one entry for each row."""
-    foreach = entry.get("foreach")
-    if foreach is None:
+    """Yield the entry itself or, with `foreach` or `array`, one entry for each row or index."""
+    foreach, array = entry.get("foreach"), entry.get("array")
+    if foreach is None and array is None:
         yield entry
         return
-    alike = Node({k: v for k, v in entry.items.items() if k != "foreach"}, entry.place)
-    for row in _checked_rows(foreach, problems):
+    rows = [{}] if foreach is None else _checked_rows(foreach, problems)
+    indexes = [None] if array is None else checked_indexes(array, MOST, problems)
+    if array is not None and len(rows) * len(indexes) > MOST:
+        problems.add(array.place, f"array: makes more than {MOST} processes with `foreach`")
+        return
+    for row, index in itertools.product(rows, indexes):
         faults = Problems()
-        made = _substituted(alike, row, faults)
+        made = _made(entry, row, index, faults)
         problems.found.update(faults.found)
         if not faults:
             yield made
+
+
+def _made(entry: Node, row: Row, index: int | None, problems: Problems) -> Node:
+    """Return the entry of one process."""
+    own = {key: node for key, node in entry.items.items() if key not in ("foreach", "array")}
+    values = row if index is None else {**row, INDEX: index}
+    made = _substituted(Node(own, entry.place), values, problems)
+    if index is None:
+        return made
+    name = entry.get("name")
+    return as_member(
+        made, index, entry, lambda text: str(_text(name or entry, text, row, problems))
+    )
 
 
 def _checked_rows(foreach: Node, problems: Problems) -> list[Row]:
@@ -166,6 +188,8 @@ def _piece(found: re.Match[str], row: Row) -> str:
         return found[0]  # the host fills it in
     name, _, form = found[1].partition(":")
     if name not in row:
+        if name == INDEX:
+            raise ValueError(f"{{{INDEX}}} needs `array` in the process")
         hint = "" if name.isidentifier() else "; write {{ and }} for plain braces"
         raise ValueError(f"unknown name {name!r}{near(name, list(row))}{hint}")
     return _formatted(row[name], form)

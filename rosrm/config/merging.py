@@ -25,6 +25,14 @@ def merged(defaults: Node, entry: Node) -> Node:
     under = dict(defaults.items)
     if any(name in entry.items for name in _PROGRAM):
         under = {name: node for name, node in under.items() if name not in _PROGRAM}
+    for own, other in (
+        ("restart", "retries"),
+        ("retries", "restart"),
+        ("every", "at"),
+        ("at", "every"),
+    ):
+        if own in entry.items:  # each excludes the other
+            under.pop(other, None)
     if entry.get("migration", "strategy") is not None and "migration" in under:
         under["migration"] = _without_options(under["migration"])
     return in_depth(Node(under, entry.place), entry)
@@ -69,6 +77,12 @@ def _pairs(node: Node) -> Node:
     return Node(members, node.place, node.key_place)
 
 
+def _list(node: Node) -> Node:
+    """Convert a single value to a list of one."""
+    many = isinstance(node.value, (tuple, Mapping))
+    return node if many else Node((node,), node.place, node.key_place)
+
+
 def _neighbours(node: Node) -> Node:
     """Convert `camera` and `[camera, {processes: [map]}]` to a list of mappings."""
     items = node.value if isinstance(node.value, tuple) else (node,)
@@ -90,4 +104,6 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "near": _neighbours,
     "apart": _neighbours,
     "spread": _word("by"),
+    "at": _list,
+    "on": _list,
 }

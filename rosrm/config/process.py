@@ -11,10 +11,22 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
-from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.extensions.units import (
+    Amount,
+    ByteRate,
+    Count,
+    PositiveCount,
+    PositiveSeconds,
+    Quantity,
+    Seconds,
+)
+from rosrm.model.arrays import INDEX_PLACEHOLDER, ArrayMembership
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
+from rosrm.model.durations import LONGEST
+from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
+from rosrm.model.schedules import SHORTEST, Schedule
 from rosrm.model.values import (
     EMPTY,
     Enforcement,
@@ -176,7 +188,11 @@ class RealtimeInFile:
 
 @dataclass(frozen=True, slots=True)
 class ProcessInFile:
-    """One process, with the keys of ROS 2 launch; shorthands are in long form."""
+    """One process, with the keys of ROS 2 launch; shorthands are in long form.
+
+    Attributes:
+        array: name and index, after the expansion of the array.
+    """
 
     name: str
     namespace: str = ""
@@ -216,6 +232,12 @@ class ProcessInFile:
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
     devices: AskedByKind = field(default_factory=lambda: EMPTY)
+    array: tuple[str, int] | None = None
+    parallel: PositiveCount | None = None
+    retries: Count | None = None
+    every: Annotated[float, Quantity("duration", low=SHORTEST, hint="seconds")] = 0.0
+    at: tuple[str, ...] = ()
+    on: tuple[str, ...] = ()
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -223,13 +245,12 @@ class ProcessInFile:
         By default a service restarts on failure, for example after a power failure. A job does not
         restart, because it may not be repeatable.
         """
-        when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
         return _same(
             ProcessSpec,
             self,
             parameters=dict(flattened(self.parameters)),
             kind=Kind(self.kind),
-            restart=_same(RestartPolicy, self.restart, when=when),
+            restart=self._restart_policy(),
             required_labels=self.labels.required,
             preferred_labels=self.labels.preferred,
             avoided_labels=self.labels.avoided,
@@ -245,8 +266,22 @@ class ProcessInFile:
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
+            array=self._membership(),
+            schedule=_same(Schedule, self),
             given=(),
         )
+
+    def _restart_policy(self) -> RestartPolicy:
+        when = self.restart.when or ("never" if self.kind == "job" else "on-failure")
+        policy = _same(RestartPolicy, self.restart, when=when)
+        if self.retries is None:
+            return policy
+        # Each restart counts for the whole run, however long the job runs before it fails.
+        return replace(policy, when="on-failure", attempts=self.retries, window=LONGEST)
+
+    def _membership(self) -> ArrayMembership:
+        name, index = self.array or ("", 0)
+        return ArrayMembership(name, index, self.parallel or 0)
 
     def _neighbour_rules(self) -> Iterator[NeighbourRule]:
         for one in self.near:
@@ -318,6 +353,33 @@ def _about_ends(spec: ProcessSpec) -> Iterator[Complaint]:
     if spec.reschedule.delay and not spec.reschedule.attempts:
         text = "reschedule.delay requires `attempts`, the number of other hosts to try"
         yield Complaint(("reschedule", "delay"), text)
+
+
+def _about_jobs(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = job_fault(spec)
+    if fault:
+        yield Complaint((fault.partition(":")[0],), fault)
+    texts = ("command", "arguments", "parameters", "remappings", "environment")
+    for key in texts if not spec.array.name else ():
+        found = INDEX_PLACEHOLDER.search(repr(getattr(spec, key)))
+        if found:
+            text = f"{key}: {found[0]} needs `array` in the process, such as `array: 1-100`"
+            yield Complaint((key,), text)
+
+
+def about_retries(spec: ProcessSpec, keys: AbstractSet[str]) -> Iterator[Complaint]:
+    """Yield the violations of the rules on `retries`, which is a short form of `restart`.
+
+    `keys`: those of the entry.
+    """
+    if "retries" in keys and "restart" in keys:
+        text = (
+            "retries is a short form of `restart: {when: on-failure, attempts: N}`; give only one"
+        )
+        yield Complaint(("retries",), text)
+    if "retries" in keys and spec.kind is not Kind.JOB:
+        text = "retries: only a job has it, and this process is a service; it has `restart`"
+        yield Complaint(("retries",), text)
 
 
 def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -425,6 +487,8 @@ def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
     if not _NODE_NAME.fullmatch(spec.name):
         allowed = "at most 200 letters, digits and '_', the first of them not a digit"
         text = f"{spec.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
+        if spec.array.name:
+            text += f"; write {{array.index}} into the name: {spec.array.name}_{{array.index}}"
         yield Complaint(("name",), text)
     if spec.namespace and not is_namespace(spec.namespace):
         text = f"{spec.namespace!r} is not an absolute namespace such as '/robot1'"
@@ -468,6 +532,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_surroundings, ("working_directory", "environment")),
     (_about_restarts, ("restart",)),
     (_about_ends, ("time_limit", "kind", "reschedule")),
+    (_about_jobs, ("array", "parallel", "every", "at", "on", "kind")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),

@@ -13,7 +13,7 @@ from rosrm.config.foreach import expanded
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
-from rosrm.config.process import ProcessInFile, complaints
+from rosrm.config.process import ProcessInFile, about_retries, complaints
 from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
 from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
@@ -22,10 +22,11 @@ from rosrm.wording import get_close_matches
 
 _SECTIONS: Final = ("processes", "defaults")
 #: Keys that are allowed in an entry but not in `defaults`.
-_NOT_IN_DEFAULTS: Final = ("name", "foreach")
+_NOT_IN_DEFAULTS: Final = ("name", "foreach", "array", "parallel")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
 _NOT_IN_CLUSTER_DEFAULTS: Final = (
-    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to",
+    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "retries", "every", "at",
+    "on",
 )  # fmt: skip
 
 
@@ -131,14 +132,14 @@ def checked_defaults(
 
 
 def _with_group(entry: Node) -> Node:
-    """Return an entry with `foreach` whose processes are a group, unless `spread` names one.
+    """Return an entry with `foreach` or `array`, whose processes are a group by default.
 
-    The group is the entry's name before the values of `foreach` are put into it.
+    The group of `spread` is the entry's name before the values are put into it.
     """
     name, spread = entry.get("name"), entry.get("spread")
     if name is None or not isinstance(name.value, str) or spread is None:
         return entry
-    if entry.get("foreach") is None or not spread.items or "group" in spread.items:
+    if not {"foreach", "array"} & entry.items.keys() or not spread.items or "group" in spread.items:
         return entry
     kept = name.value.replace("{", "{{").replace("}", "}}")
     members = {**spread.items, "group": Node(kept, spread.place)}
@@ -157,7 +158,7 @@ def _process(
         return None
     spec = process.spec()
     spec = replace(spec, given=tuple(_given(node, spec)))
-    for complaint in complaints(spec, wrong):
+    for complaint in (*complaints(spec, wrong), *about_retries(spec, node.items.keys() - wrong)):
         problems.add(node.deepest(complaint.path).place, complaint.text)
     spec = _on_host(spec, path)
     if options is not None:
@@ -172,7 +173,9 @@ def _given(node: Node, value: Any, before: str = "") -> Iterator[str]:
     """Yield the paths of the keys in an entry: of each field, and of each field of a policy."""
     for name, inner in node.items.items():
         policy = getattr(value, name, None)
-        if inner.items and is_dataclass(policy):
+        if name == "retries":  # a short form of `restart`
+            yield from (f"restart.{one}" for one in ("when", "attempts", "window"))
+        elif inner.items and is_dataclass(policy):
             yield from _given(inner, policy, f"{before}{name}.")
         else:
             yield f"{before}{name}"

@@ -12,6 +12,9 @@ ros_settings.py         ROS settings of a part: domain, discovery, transports, i
 codec.py                conversion of values to JSON and back
 durations.py            bound of all times
 links.py                measurements of links between hosts
+arrays.py               the array of a job, and the placeholder of its index
+schedules.py            times at which a job starts again
+job_checks.py           rules for arrays and schedules
 limits.py               rules for limits and scheduling of a process
 description_checks.py   checks of the description of a host
 """

@@ -59,6 +59,10 @@ class EventKind(str, Enum):
     CANCELLED = "cancelled", "the process ended because it was cancelled"
     OVERDUE = "overdue", "the time limit of the job has passed: it is stopped, and has failed"
     RESTART_REQUESTED = "restart_requested", "a client restarts the process"
+    RUN_SKIPPED = (
+        "run_skipped",
+        "the former run of the job has not ended at the time of the next one",
+    )
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
     FENCED = "fenced", "a host runs an instance that has a successor: it is killed"

@@ -76,9 +76,9 @@ class ProcessRow:
     """One process.
 
     Attributes:
-        state: "queued", "set_aside", "assigned", "starting", "running", "backoff", "stopping",
-            "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck"
-            or "unknown" (its host is silent and not lost yet).
+        state: "queued", "set_aside", "scheduled", "assigned", "starting", "running", "backoff",
+            "stopping", "migrating", "checkpointed", "finished", "failed", "cancelled",
+            "unreachable", "stuck" or "unknown" (its host is silent and not lost yet).
         host: host of the owning instance, of the image, or of the last run; "" for none.
         number: number of the owning instance; 0: none.
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
@@ -92,6 +92,8 @@ class ProcessRow:
         owner: principal that submitted it, "user:ada"; "": unknown.
         cpu_limit: cores that its host enforces; 0: no limit holds.
         memory_limit: bytes that its host enforces; 0: no limit holds.
+        array: name of its array; "": none.
+        next_run: unix time of the next run of its schedule; 0: none.
     """
 
     name: str
@@ -113,6 +115,8 @@ class ProcessRow:
     owner: str = ""
     cpu_limit: float = 0.0
     memory_limit: int = 0
+    array: str = ""
+    next_run: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

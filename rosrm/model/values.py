@@ -12,7 +12,9 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+from rosrm.model.arrays import NO_ARRAY, ArrayMembership
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
+from rosrm.model.schedules import NO_SCHEDULE, Schedule
 
 #: Slots of a `resource_info` message: highest number of resources of one host.
 RESOURCE_SLOTS: Final = 16
@@ -272,6 +274,8 @@ class ProcessSpec:
         cpus: numbers of the CPUs that it may use; (): all.
         nice: its niceness, -20..19; 0: that of the slave.
         devices: devices that it holds while it runs, each kind once.
+        array: the array of a job, and its index there.
+        schedule: times at which a job starts again.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -312,6 +316,8 @@ class ProcessSpec:
     realtime: Realtime = Realtime()
     nice: int = 0
     devices: tuple[DeviceNeed, ...] = ()
+    array: ArrayMembership = NO_ARRAY
+    schedule: Schedule = NO_SCHEDULE
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

@@ -55,6 +55,8 @@ _OTHER_ENTRIES: Final = {
     "HostDescription.cpus": 4096,
     "ProcessStatus.enforced": 16,
     "StandbyPolicy.apart_by": 256,
+    "Schedule.at": 256,
+    "Schedule.on": 7,
     "ProcessSpec.neighbours": 256,
     "NeighbourRule.processes": 1024,
     "ProcessSpec.talks_to": 256,

@@ -28,6 +28,7 @@ from rosrm.model.devices import (
     need_fault,
 )
 from rosrm.model.durations import LONGEST
+from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
@@ -87,7 +88,7 @@ _Value = TypeVar("_Value")
 _Convert = Callable[[Any], Any]
 
 #: Fields that have another name in messages.
-_RENAMED: Final = {"namespace": "ros_namespace", "facts": "data"}
+_RENAMED: Final = {"namespace": "ros_namespace", "facts": "data", "array": "job_array"}
 #: Type of a field to its conversion to a message and back.
 _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     float: (float, float),
@@ -191,7 +192,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         ),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
-    fault = limits_fault(spec)
+    fault = limits_fault(spec) or job_fault(spec)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec

@@ -1,6 +1,7 @@
 """Code shared by the entry points of master, slave and supervisor.
 
 bootstrap.py       settings and plugins, passed from the command to the runtime
+local_zone.py      time zone of the machine
 state_lock.py      one runtime for one state directory
 private_files.py   owner, mode and links of directories and files
 atomic_file.py     replacement of a whole file, or of nothing

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import Domain, Host, Name, Names
+from rosrm.cli.options import Array, Domain, Host, Name, Names
 from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 from rosrm.wording import counted
@@ -76,6 +76,8 @@ def cancel(
     everything: Annotated[
         bool, typer.Option("--all", help="All processes that have not ended.")
     ] = False,
+    array: Array = "",
+    *,
     wait: Wait = False,
     timeout: Timeout = "",
     domain: Domain = None,
@@ -85,17 +87,23 @@ def cancel(
     For a work file, all its processes that have not ended are cancelled.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
+    from rosrm.client.connecting import check_name
     from rosrm.client.waiting import ENDED
 
     limit, chosen = longest(timeout), words or []
-    if everything == bool(chosen):
-        raise ConfigError("cancel: give names of processes or work files, or --all")
+    if [everything, bool(array), bool(chosen)].count(True) != 1:
+        raise ConfigError("cancel: give names of processes or work files, --array NAME, or --all")
     named = [word for word in chosen if not _is_file(word)]
     filed = [name for word in chosen if _is_file(word) for name in _names_in(word)]
     with connection.master(ctx, domain) as client:
-        if everything or filed:
-            live = [row.name for row in client.list_processes() if row.state not in ENDED]
-            named += [name for name in live if everything or name in filed]
+        if everything or array or filed:
+            rows = client.list_processes()
+            check_name("array", array, {row.array for row in rows if row.array})
+            live = [row for row in rows if row.state not in ENDED]
+            named += [
+                row.name for row in live
+                if everything or row.name in filed or (array and row.array == array)
+            ]  # fmt: skip
         names = list(dict.fromkeys(named))
         if not names:
             echo("no process to cancel: all of them have ended, or were never submitted")

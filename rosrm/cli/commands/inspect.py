@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import AsJson, Domain, Name
+from rosrm.cli.options import Array, AsJson, Domain, Name
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 
@@ -38,20 +38,27 @@ def ps(
     host: Annotated[
         str, typer.Option("--host", metavar="HOST", help="List only processes on this host.")
     ] = "",
+    array: Array = "",
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
-    """List the processes."""
-    from rosrm.cli.output import json_forms, tables
+    """List the processes; of an array with a summary."""
+    from rosrm.cli.output import arrays, json_forms, tables
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(processes=True, hosts=bool(host))
     connection.print_trouble(snapshot)
     check_name("host", host, [row.description.name for row in snapshot.hosts])
+    check_name("array", array, {row.array for row in snapshot.processes if row.array})
     shown = [row for row in snapshot.processes if not host or row.host == host]
+    if array:
+        shown = [row for row in shown if row.array == array]
     if as_json:
-        json_forms.show(json_forms.forms(shown))
+        forms = json_forms.forms(shown)
+        json_forms.show(arrays.form(array, shown, forms) if array else forms)
         return
+    if array:
+        echo(arrays.summary(shown))
     listed = [row for row in shown if everything or row.state not in ("finished", "cancelled")]
     if listed:
         tables.show(tables.processes(listed))

@@ -37,6 +37,7 @@ STYLES: Final = {
     "selected": "green",
     "queued": "yellow",
     "set_aside": "yellow",
+    "scheduled": "cyan",
     "backoff": "yellow",
     "migrating": "cyan",
     "checkpointed": "cyan",

@@ -51,6 +51,7 @@ _ORDER: Final = (
     "checkpointed",
     "set_aside",
     "queued",
+    "scheduled",
     "failed",
     "cancelled",
     "finished",

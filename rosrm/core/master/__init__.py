@@ -7,7 +7,7 @@ tick.py        periodic work
 requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
                pruning.py, graph_names.py
 answers.py     answers of slaves to orders; reloading.py
-lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py
+lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
 scheduling/    choice of a host for a process: filter, score, pick
 assignment/    assignment of waiting processes, reservation of their load

@@ -149,8 +149,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
     if process is None:
         return
     if status.state in _ALIVE and not process.began:
-        process.started_at, process.began = now, state.wall
-        state.save(process)
+        _note_start(state, process, now)
     if process.restarts != status.restarts:
         process.phase_before_loss = None  # restarted while its host was silent
         note_run(process, status)  # of the run before the restart
@@ -161,6 +160,14 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
         stop_instance(state, instance, now)  # the standby is ready sooner, and has the snapshot
     if process.name not in state.migrations:
         _follow(state, process, instance, status, now, repeated=before is status.state)
+
+
+def _note_start(state: MasterState, process: Process, now: float) -> None:
+    """Note the first start of a process since it left the queue."""
+    process.started_at, process.began = now, state.wall
+    if process.spec.schedule and not process.next_run:
+        process.next_run = process.spec.schedule.next_run(state.wall)
+    state.save(process)
 
 
 def _follow(

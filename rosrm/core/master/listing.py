@@ -13,6 +13,7 @@ from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.process_defaults import defaulted_values
+from rosrm.core.master.schedules import why_scheduled
 from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
@@ -90,7 +91,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     silence = _silence(state, owner, now)
     phase, since = process.phase.value, now - process.since
     standby = process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
-    reason = reason_of(state, process) or standby or _awaited_node(process, owner)
+    reason = _reason_of_phase(state, process) or standby or _awaited_node(process, owner)
     if owner is not None and silence is not None and process.phase in _OBSERVED:
         said = f"{owner.host.name} has been silent for {silence:.0f} s"
         phase, reason, since = "unknown", f"{said}; last known: {phase}", silence
@@ -107,8 +108,22 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         queue_position=state.queue.position(process.name), since=since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
         cpu_limit=_limit(process, owner, "cpu"), memory_limit=int(_limit(process, owner, "memory")),
-        stale=silence is not None, owner=process.principal,
+        stale=silence is not None, owner=process.principal, array=process.spec.array.name,
+        next_run=0.0 if process.phase.is_terminal else process.next_run,
     )  # fmt: skip
+
+
+def _reason_of_phase(state: MasterState, process: Process) -> str:
+    """Return why a process is in its phase; "" for no reason."""
+    if process.phase is ProcessPhase.SCHEDULED:
+        return why_scheduled(state, process)
+    if process.name not in state.queue.arrays:
+        return reason_of(state, process)
+    taken = state.queue.arrays.taken(process)
+    running = sum(bool(state.processes[name].instances) for name in taken)
+    run = f"{running} of the array {process.spec.array.name} run already" if running else ""
+    next_ones = f"{len(taken) - running} of it are next" if len(taken) > running else ""
+    return ", and ".join(filter(None, (run, next_ones)))
 
 
 def _limit(process: Process, owner: Instance | None, name: str) -> float:
@@ -235,7 +250,7 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
     room = made.reason if made is not None else ""
     if position <= 1 or room:
         owner = state.instances.get(process.owner)
-        reason = reason_of(state, process) or _awaited_node(process, owner)
+        reason = _reason_of_phase(state, process) or _awaited_node(process, owner)
         return f"{reason}; {room}" if room and room != reason else reason
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
@@ -249,6 +264,10 @@ def _advice(state: MasterState, process: Process) -> str:
     logs = f"`rosrm logs {process.name}` shows its output"
     if process.phase is ProcessPhase.BACKOFF:
         return logs
+    if process.phase is ProcessPhase.SCHEDULED:
+        now = f"`rosrm restart {process.name}` starts a run now"
+        end = f"`rosrm cancel {process.name}` ends its schedule"
+        return f"{logs}, {now}, {end}" if process.ended_on else f"{now}, {end}"
     if process.phase is ProcessPhase.FAILED:
         again = (
             f"`rosrm restart {process.name}` starts it again, `rosrm submit FILE` replaces it by a "

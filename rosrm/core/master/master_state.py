@@ -50,6 +50,8 @@ _HISTORY: Final = 12
 _RESERVED: Final = 1000
 #: Phases between the rejoin of a host and its report of its instances.
 _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
+#: Phases in which a run ends; if the process has a schedule, it waits for the next run.
+_ENDS_OF_RUNS: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED})
 #: Number of removed processes whose replicas are dropped when a host returns with one.
 _MOST_REMOVED: Final = 10_000
 #: Faster than `fields_to_plain`: each decision waits until its process is saved.
@@ -87,6 +89,7 @@ class MasterState:
         placement: the policies and filters that judge hosts.
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
+        scheduled: names of the processes with a schedule that are not terminal.
         terminal: names of the terminal processes, in the order in which they ended.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
@@ -130,6 +133,7 @@ class MasterState:
         self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
         self.time_limited: dict[str, None] = {}
+        self.scheduled: dict[str, None] = {}
         self.preemption = Preemption()
         self.rebalancing = Rebalancing()
         self.reloads = Reloads()
@@ -271,11 +275,23 @@ class MasterState:
     def set_phase(
         self, process: Process, phase: ProcessPhase, now: float, reason: str = ""
     ) -> None:
-        """Move a process to another phase."""
+        """Move a process to another phase; a run of a schedule ends in the phase SCHEDULED."""
+        if process.spec.schedule and phase in _ENDS_OF_RUNS:
+            phase, reason = self._after_run(process, phase, reason)
         if process.phase is not phase:
             self._begin_phase(process, phase, now)
         process.reason = reason
         self._update_terminal(process)
+
+    def _after_run(
+        self, process: Process, end: ProcessPhase, reason: str
+    ) -> tuple[ProcessPhase, str]:
+        """Return phase and reason of a process between two runs of its schedule."""
+        process.wanted, process.overdue = DesiredState.RUN, False
+        if not process.next_run:  # its first run has not started
+            process.next_run = process.spec.schedule.next_run(self.wall)
+        details = f": {reason}" if reason else ""
+        return ProcessPhase.SCHEDULED, f"its last run {end.value}{details}"
 
     def _begin_phase(self, process: Process, phase: ProcessPhase, now: float) -> None:
         """Change the phase and note its start.
@@ -304,6 +320,8 @@ class MasterState:
             self.terminal.pop(process.name, None)
             if process.spec.time_limit:
                 self.time_limited.setdefault(process.name)
+            if process.spec.schedule:
+                self.scheduled.setdefault(process.name)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
@@ -313,6 +331,7 @@ class MasterState:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
             self.time_limited.pop(process.name, None)
+            self.scheduled.pop(process.name, None)
             self.neighbours.remove(process.name)
             self.flows.remove(process.name)
 
@@ -359,7 +378,22 @@ class MasterState:
         self.put_in_queue(process)
 
     def put_in_queue(self, process: Process) -> None:
-        """Add a process whose phase is QUEUED to the queue."""
+        """Add a process whose phase is QUEUED to the queue, once its array has a place for it."""
+        if process.spec.array.parallel:
+            self.queue.arrays.add(process)
+        else:
+            self._put_in_queue(process)
+
+    def admit_from_arrays(self) -> None:
+        """Add the jobs to the queue for which their arrays have a place now."""
+        for name in self.queue.arrays.admitted(self._has_place):
+            self._put_in_queue(self.processes[name])
+
+    def _has_place(self, name: str) -> bool:
+        process = self.processes.get(name)
+        return process is not None and (name in self.queue or bool(process.instances))
+
+    def _put_in_queue(self, process: Process) -> None:
         self.queue.add(process.name, process.spec.priority, process.order)
         if process.queue_delay:
             self.queue.delayed.add(process.name)
@@ -368,6 +402,7 @@ class MasterState:
         """Remove the process from the queue and from the set-aside list."""
         if process.name in self.queue:
             self.queue.remove(process.name)
+        self.queue.arrays.remove(process)
         self.set_aside.discard(process.name)
 
     def instances_of(self, owner: Process | Host) -> list[Instance]:
@@ -482,6 +517,8 @@ class MasterState:
         """Note that the instances of a process, or the one that owns its name, have changed."""
         self.neighbours.note_change(name)
         self.flows.note_change(name)
+        if name in self.processes:
+            self.queue.arrays.note_change(self.processes[name])
 
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""

@@ -9,7 +9,7 @@ from typing import Final
 from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
-from rosrm.core.master.checkpoint import image_requests, images, replication
+from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
 from rosrm.core.master.graph_names import shared_nodes
@@ -21,9 +21,10 @@ from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
-from rosrm.core.master.rescheduling import forget_failures
+from rosrm.core.master.rescheduling import allow_every_host
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.scheduling.feasibility import unknown_resources
+from rosrm.core.master.schedules import await_first_run, queue_again
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -77,12 +78,23 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     for process in processes:
         state.next_order += 1
         state.add_process(process)
-        state.enqueue(process, now)
+        if not await_first_run(state, process, now):
+            state.enqueue(process, now)
         message = f"{process.name} was submitted"
         state.record(now, EventKind.SUBMITTED, message, process=process.name, by=event.by)
         state.save(process)
     warnings = "".join(f". Warning: {one}" for one in doubts)
-    state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
+    state.emit(Reply(event.request, message=f"{_accepted(processes)}{warnings}"))
+
+
+def _accepted(processes: Sequence[Process]) -> str:
+    """Return the outcome of a submission: "2 processes queued; 1 waits for its first run"."""
+    later = sum(process.phase is ProcessPhase.SCHEDULED for process in processes)
+    if not later:
+        return f"{count(len(processes))} queued"
+    waiting = f"{count(later)} {'waits' if later == 1 else 'wait'} for the first run"
+    queued = len(processes) - later
+    return f"{count(queued)} queued; {waiting}" if queued else waiting
 
 
 def _owned_from(state: MasterState, name: str, by: Requester) -> int:
@@ -270,6 +282,10 @@ def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> 
         state.record(
             now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
         )
+    elif process.phase is ProcessPhase.SCHEDULED:
+        state.set_phase(process, ProcessPhase.CANCELLED, now, process.reason)
+        message = f"{process.name} cancelled between two runs: its schedule has ended"
+        state.record(now, EventKind.CANCELLED, message, process=process.name)
     elif process.image is not None and process.name not in state.migrations:
         images.cancel(state, process, now)
     elif process.owner == 0 and process.name not in state.migrations:
@@ -308,7 +324,7 @@ def _restart_fault(state: MasterState, process: Process) -> str:
         return f"{process.name} waits in the queue already"
     if process.name in state.migrations:
         return why_busy(state.migrations[process.name])
-    if process.phase.is_terminal or process.image is not None:
+    if process.is_at_rest or process.image is not None:
         return _still_stopping(state, process.name)
     if process.wanted is not DesiredState.RUN:
         return f"{process.name} is being stopped"
@@ -322,16 +338,11 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         now, EventKind.RESTART_REQUESTED, f"a restart of {process.name} was requested",
         process=process.name, by=by,
     )  # fmt: skip
-    if process.phase.is_terminal or process.image is not None:
-        images.drop(state, process)
-        replication.drop_former_replicas(state, process)
-        _allow_every_host(process)
-        process.order = state.next_order
-        state.next_order += 1
-        state.enqueue(process, now)
+    if process.is_at_rest or process.image is not None:
+        queue_again(state, process, now)
     elif process.phase in WAITING:
         state.unqueue(process)
-        _allow_every_host(process)
+        allow_every_host(process)
         state.enqueue(process, now)
     elif (owner := state.instances[process.owner]).state is not None:
         # An instance that its slave has not accepted yet starts without this order. An order to
@@ -339,11 +350,6 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         owner.restarting = True
         state.send(owner.host, RestartInstance(owner.id))
     state.save(process)
-
-
-def _allow_every_host(process: Process) -> None:
-    process.excluded.clear()
-    forget_failures(process)
 
 
 # --- migrate, cordon, drain -------------------------------------------------------------------

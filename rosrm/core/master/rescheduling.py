@@ -50,6 +50,12 @@ def forget_failures(process: Process) -> None:
     process.demand = None
 
 
+def allow_every_host(process: Process) -> None:
+    """Let a process start on the hosts again that have refused it or on which it failed."""
+    process.excluded.clear()
+    forget_failures(process)
+
+
 def failures(process: Process) -> str:
     """Return a phrase on the hosts that are excluded because a process failed there; "": none."""
     failed = process.failed_on.items()

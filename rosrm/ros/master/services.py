@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
 from rosrm.config.settings import ControlSettings
@@ -28,6 +28,7 @@ from rosrm.ros.introductions import ticket_version
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
+from rosrm.runtime.local_zone import local_zone
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm.wording import sanitized
 from rosrm_msgs import srv
@@ -363,6 +364,10 @@ def _check_name(slave: Peer, name: str) -> None:
 
 def _submitted(request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
     specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
+    if any(spec.schedule.at for spec in specs):
+        # Here, because the core knows no machine, and a replay on another one gives the same runs.
+        zone = local_zone()
+        specs = tuple(replace(spec, schedule=spec.schedule.in_zone(zone)) for spec in specs)
     return happened.SubmissionReceived(token, specs, _requester(peer))
 
 

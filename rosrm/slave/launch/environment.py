@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm.model.arrays import INDEX_VARIABLE
 from rosrm.model.devices import DEVICE_VARIABLE, Device, device_environment, device_values
 from rosrm.model.values import Assignment, InstanceId, qualified_name
 from rosrm.ros.fast_dds import announcements
@@ -28,6 +29,7 @@ INSTANCE_KEY: Final = "ROSRM_INSTANCE_KEY"
 _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
     "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY,
+    INDEX_VARIABLE,
 )  # fmt: skip
 
 
@@ -90,6 +92,8 @@ def process_environment(
         environment[EPOCH_FILE] = str(where.epoch_file)
     if spec.ros:  # the name without the alias
         environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
+    if spec.array.name:
+        environment[INDEX_VARIABLE] = str(spec.array.index)
     if assignment.shadow:
         environment[SHADOW] = "1"
     if assignment.has_snapshots and where.snapshots is not None:

@@ -106,6 +106,31 @@ def test_a_master_that_accepts_no_work_is_reported_beside_the_listing(
         assert result.out == whole.out
 
 
+def test_ps_of_an_array_has_a_summary(rosrm, client):
+    """The failed jobs are named with their reasons, also in JSON."""
+    client.processes = [
+        process("r-1", "finished", array="r"), process("r-2", "finished", array="r"),
+        process("r-3", "failed", exit_code=2, array="r"), process("s"),
+    ]  # fmt: skip
+    lines = rosrm("ps", "--array", "r").out.splitlines()
+    assert lines[0] == "3: 2 finished, 1 failed (r-3: exit code 2)"
+    assert not any("s " in line.split("  ") for line in lines)
+    found = json.loads(rosrm("ps", "--array", "r", "--json").out)
+    assert (found["array"], found["summary"]) == ("r", lines[0])
+    assert found["states"] == {"finished": 2, "failed": 1}
+    assert [row["name"] for row in found["processes"]] == ["r-1", "r-2", "r-3"]
+    assert "no such array: 'q'; there are: r" in rosrm("ps", "--array", "q").err
+
+
+def test_ps_shows_when_a_job_runs_again(rosrm, client):
+    """The reason has the time; JSON has it as unix time."""
+    why = "next run at 02:00 UTC (in 5 h); its last run failed: exit code 2"
+    client.processes = [process("p", "scheduled", reason=why, next_run=1.8e9, exit_code=2)]
+    assert why in rosrm("ps").out
+    (row,) = json.loads(rosrm("ps", "--json").out)
+    assert (row["next_run"], row["exit_code"]) == (1.8e9, 2)
+
+
 def test_ps_leaves_out_terminal_processes_and_counts_them(rosrm, client):
     out = rosrm("ps").out
     assert "done" not in out
@@ -150,7 +175,8 @@ def test_ps_json_has_every_process_with_every_field(rosrm, client):
         "name": "talker", "kind": "service", "state": "running", "host": "alpha", "number": 1,
         "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
         "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
-        "stale": False, "owner": "", "cpu_limit": 0.0, "memory_limit": 0,
+        "stale": False, "owner": "", "cpu_limit": 0.0, "memory_limit": 0, "array": "",
+        "next_run": 0.0,
     }  # fmt: skip
 
 

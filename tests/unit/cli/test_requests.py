@@ -194,11 +194,24 @@ def test_cancel_of_what_has_ended_says_so(rosrm, client, work):
         assert (result.code, result.out.startswith("no process to cancel")) == (0, True)
 
 
-@pytest.mark.parametrize("words", [[], ["--all", "a"]])
+def test_cancel_takes_the_jobs_of_an_array(rosrm, client):
+    """Those that have ended are left out; an unknown array is refused with the nearest one."""
+    client.processes = [
+        process("r-1", array="r"), process("r-2", "finished", array="r"), process("s"),
+        process("r-3", "scheduled", array="r"),
+    ]  # fmt: skip
+    assert rosrm("cancel", "--array", "r").code == 0
+    assert client.asked[-1] == ("cancel", ["r-1", "r-3"])
+    result = rosrm("cancel", "--array", "rr")
+    assert (result.code, client.asked[-1][0]) == (1, "list")
+    assert "no such array: 'rr'" in result.err
+
+
+@pytest.mark.parametrize("words", [[], ["--all", "a"], ["--array", "r", "a"]])
 def test_cancel_needs_names_or_all_of_them(rosrm, client, words):
     result = rosrm("cancel", *words)
     assert (result.code, client.asked) == (2, [])
-    assert "give names of processes or work files, or --all" in result.err
+    assert "give names of processes or work files, --array NAME, or --all" in result.err
 
 
 def test_cancel_wait_ends_when_all_have_ended(rosrm, client, while_asleep):

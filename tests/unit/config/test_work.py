@@ -35,7 +35,7 @@ def one(path):
 def test_every_key_of_a_process_reaches_its_spec():
     """A key that is only in the form of the file would be accepted without an effect."""
     in_file = {field.name for field in fields(ProcessInFile)}
-    others = {"labels", "near", "apart", "spread"}
+    others = {"labels", "near", "apart", "spread", "parallel", "retries", "every", "at", "on"}
     assert in_file - {field.name for field in fields(ProcessSpec)} == others
 
 

@@ -14,17 +14,18 @@ from rosrm.core.master.state.process import DesiredState, ProcessPhase
 
 def no_process_is_lost(state: MasterState) -> None:
     """Check that each process is in exactly one place that matches its phase."""
-    queued = set(state.queue)
+    queued = {*state.queue, *state.queue.arrays}
+    assert len(queued) == len(state.queue) + len(list(state.queue.arrays))
     for process in state.processes.values():
         name, phase = process.name, process.phase
         assert (phase is ProcessPhase.QUEUED) == (name in queued), (name, phase)
         assert (phase is ProcessPhase.SET_ASIDE) == (name in state.set_aside), (name, phase)
         moving = name in state.migrations
         assert moving or phase not in (ProcessPhase.MIGRATING, ProcessPhase.STUCK)
-        if phase.is_terminal or name in queued or name in state.set_aside:
+        if process.is_at_rest or name in queued or name in state.set_aside:
             assert not process.owner, (name, phase)
             assert not moving
-            assert phase.is_terminal or not process.instances
+            assert process.is_at_rest or not process.instances
         elif not moving:
             waits_for_an_end = process.wanted is not DesiredState.RUN and process.instances
             assert process.owner in state.instances or waits_for_an_end, (name, phase)

@@ -23,7 +23,9 @@ from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.model.arrays import NO_ARRAY, ArrayMembership
 from rosrm.model.devices import Device, DeviceNeed
+from rosrm.model.schedules import NO_SCHEDULE, Schedule
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
@@ -103,7 +105,8 @@ def spec(
         standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
         time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
-        devices=NEEDS[devices],
+        devices=NEEDS[devices], array=ArrayMembership("r", 0, 2) if kind == "job" else NO_ARRAY,
+        schedule=Schedule(every=4.0) if kind == "job" and memory == 300 else NO_SCHEDULE,
     )  # fmt: skip
 
 

@@ -13,7 +13,15 @@ import yaml
 from hypothesis import given
 
 from rosrm.errors import LaunchError
-from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy, StopPolicy
+from rosrm.model.arrays import ArrayMembership
+from rosrm.model.values import (
+    Assignment,
+    InstanceId,
+    Kind,
+    ProcessSpec,
+    RestartPolicy,
+    StopPolicy,
+)
 from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
 from rosrm.slave.launch.command import launch_order
@@ -378,6 +386,14 @@ def test_a_node_gets_its_own_name_in_its_environment():
     assert made["ROSRM_EPOCH"] == "3"
     packaged = assignment(package="demo_nodes", executable="talker", namespace="/")
     assert process_environment(packaged, {}, HERE)["ROSRM_NODE"] == "/talker"
+
+
+def test_a_job_of_an_array_knows_its_index():
+    """A process without an array has no index, even if its slave was started by such a job."""
+    job = assignment(command=("x",), kind=Kind.JOB, array=ArrayMembership("r", 0))
+    made = process_environment(job, {}, HERE)
+    assert made["ROSRM_ARRAY_INDEX"] == "0"
+    assert "ROSRM_ARRAY_INDEX" not in process_environment(assignment(command=("x",)), made, HERE)
 
 
 def test_a_process_knows_the_file_with_the_masters_epoch():

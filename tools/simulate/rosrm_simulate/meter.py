@@ -233,7 +233,7 @@ class Meter:
         phases = [process.phase for process in state.processes.values()]
         over = sum(phase.is_terminal for phase in phases)
         finished = sum(phase is ProcessPhase.FINISHED for phase in phases)
-        waiting = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
+        waiting = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE, ProcessPhase.SCHEDULED)
         never = {
             name: _why_not_placed(state, process)
             for name, process in state.processes.items()

@@ -187,6 +187,7 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 
 def place_waiting(state: MasterState, now: float) -> None:
     """Assign queued processes until the head fits nowhere (`backfill`: until no process fits)."""
+    state.admit_from_arrays()
     head = state.queue.head()
     if head is None or state.placed_at == _versions(state):
         return
@@ -367,14 +368,13 @@ def _assign(
 
 
 def _set_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
-    state.queue.remove(process.name)
+    state.unqueue(process)
     if refused_everywhere(state.hosts, demand_of(state, process)):
-        state.set_phase(process, ProcessPhase.FAILED, now, f"no host can start it: {reason}")
+        why = f"no host can start it: {reason}"
+        state.set_phase(process, ProcessPhase.FAILED, now, why)
         process.ended_on = next(reversed(process.failed_on), "")  # of its last run, with its logs
         state.note_decision(process, decide_now(state, process), "set_aside", now)
-        state.record(
-            now, EventKind.FAILED, f"{process.name} failed: {process.reason}", process=process.name
-        )
+        state.record(now, EventKind.FAILED, f"{process.name} failed: {why}", process=process.name)
     else:
         state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
         state.set_aside.add(process.name)

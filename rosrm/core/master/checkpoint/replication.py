@@ -47,7 +47,7 @@ _LOOK_EVERY: Final = 1.0
 #: Highest number of drop orders in memory, which prevents that one is repeated at once.
 _REMEMBERED: Final = 10_000
 #: Phases in which the replicas of a process are useless.
-_DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED})
+_DONE: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.CANCELLED, ProcessPhase.SCHEDULED})
 
 
 # --- reports ----------------------------------------------------------------------------------

@@ -70,13 +70,13 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     process = Process(
         spec=from_plain(ProcessSpec, item["spec"]), phase=phase,
         since=now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
-        ended_on=item["host"] if phase.is_terminal else "",
+        ended_on=item["host"],
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
     process.set_start(process.began, state.wall, now)
-    if not phase.is_terminal:
-        process.exit_code = None
+    if not process.is_at_rest:
+        process.exit_code, process.ended_on = None, ""
     state.add_process(process)
     images.set_image(state, process, None if image is None else from_plain(Image, image))
     return process
@@ -90,7 +90,7 @@ def _restore_place(state: MasterState, process: Process, now: float) -> None:
     elif process.image is not None:
         trouble = process.reason if process.phase is ProcessPhase.CHECKPOINTED else ""
         images.note_checkpointed(state, process, now, trouble)
-    elif not process.phase.is_terminal:
+    elif not process.is_at_rest:
         _expect_to_run(state, process, now)
 
 

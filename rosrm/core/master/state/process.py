@@ -23,6 +23,7 @@ class ProcessPhase(str, Enum):
 
     QUEUED = "queued"
     SET_ASIDE = "set_aside"
+    SCHEDULED = "scheduled"
     ASSIGNED = "assigned"
     STARTING = "starting"
     RUNNING = "running"
@@ -174,7 +175,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on",
+    "failed_on", "next_run",
 )  # fmt: skip
 
 
@@ -214,6 +215,7 @@ class Process:
         overdue: True: its time limit has passed, and it is being stopped.
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
+        next_run: unix time of the next run of its schedule; 0: none.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
@@ -251,6 +253,7 @@ class Process:
     overdue: bool = False
     reschedules: int = 0
     queue_delay: float = 0.0
+    next_run: float = 0.0
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()
     demand: tuple[int, Demand] | None = None
@@ -264,6 +267,11 @@ class Process:
     def name(self) -> str:
         """Return its name."""
         return self.spec.name
+
+    @property
+    def is_at_rest(self) -> bool:
+        """Return True if nothing of it runs or waits for a host: terminal, or between two runs."""
+        return self.phase.is_terminal or self.phase is ProcessPhase.SCHEDULED
 
     @property
     def forbidden_hosts(self) -> dict[str, str]:

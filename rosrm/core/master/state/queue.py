@@ -5,6 +5,8 @@ from __future__ import annotations
 from bisect import bisect_left, insort
 from collections.abc import Iterator
 
+from rosrm.core.master.state.arrays import ArrayPlaces
+
 _Key = tuple[int, int, str]
 
 
@@ -14,11 +16,13 @@ class Queue:
     Attributes:
         version: counter of changes.
         delayed: names in it that wait for the end of their delay.
+        arrays: jobs that wait outside of it, because their array has no place for them.
     """
 
     def __init__(self) -> None:
         self.version = 0
         self.delayed: set[str] = set()
+        self.arrays = ArrayPlaces()
         self._keys: list[_Key] = []
         self._of: dict[str, _Key] = {}
 

@@ -1,0 +1,137 @@
+"""Arrays: jobs of one entry, with a bound on the jobs at a time."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import listing
+from rosrm.model.arrays import ArrayMembership
+from rosrm.model.requester import Requester
+from rosrm.model.values import ProcessSpec, ReschedulePolicy
+from tests.unit.core import invariants
+from tests.unit.core.cluster import Cluster, Machine, job, process
+
+
+def array(
+    count: int = 4, parallel: int = 2, name: str = "r", **fields: object
+) -> list[ProcessSpec]:
+    """Return the jobs of an array: r-1, r-2, ..."""
+    return [
+        job(f"{name}-{index}", array=ArrayMembership(name, index, parallel), **fields)
+        for index in range(1, count + 1)
+    ]
+
+
+def running(cluster: Cluster) -> list[str]:
+    return sorted(name for name in cluster.state.processes if cluster.where(name))
+
+
+def reason(cluster: Cluster, name: str) -> str:
+    return listing.process_row(cluster.state, cluster[name], cluster.now).reason
+
+
+def test_at_most_parallel_jobs_of_an_array_run_at_a_time() -> None:
+    """The next one follows when one has ended, in order."""
+    cluster = Cluster("a", "b").with_processes(*array())
+    assert running(cluster) == ["r-1", "r-2"]
+    assert reason(cluster, "r-3") == "2 of the array r run already"
+    assert reason(cluster, "r-3") in cluster.explain("r-3")["reason"]
+    cluster.finish("r-1", on=cluster.where("r-1")[0], code=1)
+    assert running(cluster) == ["r-2", "r-3"]
+    cluster.cancel("r-2")
+    assert running(cluster) == ["r-3", "r-4"]
+
+
+def test_jobs_beyond_the_bound_do_not_block_those_behind_them() -> None:
+    """Other processes and other arrays are placed at once."""
+    cluster = Cluster("a").with_processes(*array(parallel=1), process("p"))
+    cluster.submit(*array(2, 1, name="s"))
+    assert running(cluster) == ["p", "r-1", "s-1"]
+
+
+def test_without_a_bound_all_jobs_run() -> None:
+    """The array is then a name only."""
+    cluster = Cluster("a").with_processes(*array(parallel=0))
+    assert len(running(cluster)) == 4
+
+
+def test_a_job_that_waits_for_a_host_has_a_place() -> None:
+    """The others say so."""
+    cluster = Cluster()
+    cluster.submit(*array(3))
+    assert cluster.queue() == ["r-1", "r-2"]
+    assert reason(cluster, "r-3") == "2 of it are next"
+
+
+def test_a_waiting_job_can_be_cancelled_and_submitted_again() -> None:
+    """The new one waits behind the others."""
+    cluster = Cluster("a").with_processes(*array(4, 1))
+    cluster.cancel("r-2")
+    assert cluster.phase("r-2") == "cancelled"
+    assert cluster.submit(array(4, 1)[1]).accepted
+    cluster.finish("r-1")
+    assert running(cluster) == ["r-3"]
+
+
+def test_the_bound_survives_a_restart_of_the_master() -> None:
+    """Also if a job that waits has an earlier order than one that runs."""
+    cluster = Cluster("a", "b")
+    cluster.submit(*array(4, 2, reschedule=ReschedulePolicy(1, 30.0)))
+    (host,) = cluster.where("r-1")
+    cluster.finish("r-1", on=host, code=1)
+    before = running(cluster)
+    cluster.restart_master()
+    cluster.wait(2.0)
+    assert running(cluster) == before
+    invariants.no_process_is_lost(cluster.state)
+
+
+def test_a_job_that_is_set_aside_gives_up_its_place() -> None:
+    """No host may take it, so the next one runs."""
+    cluster = Cluster("a")
+    first = array(1, 1, required_labels={"arm": "yes"})
+    cluster.submit(*first, *array(3, 1)[1:])
+    cluster.wait(0.5)
+    assert cluster.phase("r-1") == "set_aside"
+    assert running(cluster) == ["r-2"]
+    cluster.add(Machine("b", labels={"arm": "yes"}))
+    cluster.wait(1.0)
+    assert running(cluster) == ["r-2"]
+    cluster.finish("r-2")
+    assert running(cluster) == ["r-1"]
+
+
+def test_arrays_of_two_users_are_apart() -> None:
+    """Another user's jobs take no place, although the array has the same name."""
+    cluster = Cluster("a")
+    ada, bob = (Requester(f"user:{name}") for name in ("ada", "bob"))
+    cluster.ask(happened.SubmissionReceived, tuple(array(2, 1)[:1]), ada)
+    cluster.ask(happened.SubmissionReceived, tuple(array(2, 1)[1:]), bob)
+    assert running(cluster) == ["r-1", "r-2"]
+
+
+@pytest.mark.parametrize("backfill", [True, False])
+@given(data=st.data())
+def test_the_bound_holds_whatever_happens(backfill: bool, data: st.DataObject) -> None:
+    """Ends, failures, cancellations, restarts and lost hosts in any order."""
+    parallel = data.draw(st.integers(1, 3))
+    cluster = Cluster("a", "b", backfill=backfill, lease=2.0)
+    cluster.submit(*array(6, parallel, reschedule=ReschedulePolicy(1)))
+    for _ in range(data.draw(st.integers(1, 8))):
+        name = f"r-{data.draw(st.integers(1, 6))}"
+        change = data.draw(st.sampled_from(["end", "end", "fail", "cancel", "restart", "master"]))
+        where = cluster.where(name)
+        if change in ("end", "fail") and where:
+            cluster.finish(name, on=where[0], code=int(change == "fail"))
+        elif change == "cancel":
+            cluster.cancel(name)
+        elif change == "restart":
+            cluster.restart(name)
+        elif change == "master":
+            cluster.restart_master()
+        cluster.wait(0.3)
+        assert len(running(cluster)) <= parallel
+        invariants.no_process_is_lost(cluster.state)
