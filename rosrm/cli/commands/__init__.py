@@ -19,7 +19,7 @@ from typing import Annotated, Any
 
 import typer
 
-from rosrm.cli.commands import change, check, follow, inspect, key, plugin, runtimes
+from rosrm.cli.commands import applications, change, check, follow, inspect, key, plugin, runtimes
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
 from rosrm.cli.options import CommonOptions, Domain
@@ -113,7 +113,7 @@ def common(
     ctx.obj = CommonOptions(domain, cluster)
 
 
-for module in (runtimes, change, inspect, follow):
+for module in (runtimes, change, applications, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
 add_command(app, "config", check.config)

@@ -67,7 +67,7 @@ def submit(
                 show_processes(client.wait(names, timeout=limit, on_change=show_change))
 
 
-def cancel(
+def cancel(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     words: Annotated[
         list[str] | None,
@@ -76,34 +76,47 @@ def cancel(
     everything: Annotated[
         bool, typer.Option("--all", help="All processes that have not ended.")
     ] = False,
+    application: Annotated[
+        str,
+        typer.Option("--app", metavar="APP", help="All processes of an application."),
+    ] = "",
     wait: Wait = False,
     timeout: Timeout = "",
     domain: Domain = None,
 ) -> None:
     """Cancel processes: remove them from the queue, or stop them for good.
 
-    For a work file, all its processes that have not ended are cancelled.
+    For a work file, all its processes that have not ended are cancelled. A cancelled application
+    keeps its versions: `rosrm revert APP` makes one of them the desired one again.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
     from rosrm.client.waiting import ENDED
 
     limit, chosen = longest(timeout), words or []
-    if everything == bool(chosen):
-        raise ConfigError("cancel: give names of processes or work files, or --all")
+    if sum(map(bool, (everything, chosen, application))) != 1:
+        raise ConfigError("cancel: give names of processes or work files, or --app, or --all")
     named = [word for word in chosen if not _is_file(word)]
-    filed = [name for word in chosen if _is_file(word) for name in _names_in(word)]
+    filed = {name for word in chosen if _is_file(word) for name in _names_in(word)}
     with connection.master(ctx, domain) as client:
-        if everything or filed:
-            live = [row.name for row in client.list_processes() if row.state not in ENDED]
-            named += [name for name in live if everything or name in filed]
+        if application:
+            echo(client.cancel_application(application).message)
+        if everything or filed or application:
+            live = [row for row in client.list_processes() if row.state not in ENDED]
+            named += [
+                row.name
+                for row in live
+                if everything or row.name in filed or row.application == (application or None)
+            ]
         names = list(dict.fromkeys(named))
-        if not names:
+        outcome = ""
+        if not names and not application:
             echo("no process to cancel: all of them have ended, or were never submitted")
             return
-        outcome = client.cancel(names)
-        echo(outcome)
+        if not application:
+            outcome = client.cancel(names)
+            echo(outcome)
         # If all processes were still queued, the master's reply reports their end already.
-        if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
+        if wait and names and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
                 show_processes(
                     client.wait(names, until="ended", timeout=limit, on_change=show_change)

@@ -38,6 +38,9 @@ def ps(
     host: Annotated[
         str, typer.Option("--host", metavar="HOST", help="List only processes on this host.")
     ] = "",
+    application: Annotated[
+        str, typer.Option("--app", metavar="APP", help="List only processes of this application.")
+    ] = "",
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
@@ -45,10 +48,15 @@ def ps(
     from rosrm.cli.output import json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        snapshot = client.list(processes=True, hosts=bool(host))
+        snapshot = client.list(processes=True, hosts=bool(host), applications=bool(application))
     connection.print_trouble(snapshot)
     check_name("host", host, [row.description.name for row in snapshot.hosts])
-    shown = [row for row in snapshot.processes if not host or row.host == host]
+    check_name("application", application, [row.name for row in snapshot.applications])
+    shown = [
+        row
+        for row in snapshot.processes
+        if (not host or row.host == host) and application in ("", row.application)
+    ]
     if as_json:
         json_forms.show(json_forms.forms(shown))
         return

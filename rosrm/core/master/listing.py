@@ -107,7 +107,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         queue_position=state.queue.position(process.name), since=since,
         cpu=seen.get("cpu", 0.0), memory=int(seen.get("memory", 0.0)), reason=reason,
         cpu_limit=_limit(process, owner, "cpu"), memory_limit=int(_limit(process, owner, "memory")),
-        stale=silence is not None, owner=process.principal,
+        stale=silence is not None, owner=process.principal, application=process.spec.application,
     )  # fmt: skip
 
 
