@@ -422,7 +422,7 @@ class Client:
         self.close()
 
 
-def _ignore(row: ProcessRow) -> None:
+def _ignore(_row: object) -> None:
     """Take a change that no caller wants."""
 
 

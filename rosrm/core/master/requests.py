@@ -62,10 +62,10 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_quota(state, specs, event.by)
     processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
-    nodes = {process.node for process in processes}
+    nodes, names = {one.node for one in processes}, {one.name for one in processes}
     users = [one for one in state.processes.values() if one.node in nodes]
-    live = [one for one in users if not one.phase.is_terminal]
-    shared = shared_nodes((one.name, one.node) for one in live)
+    others = [one for one in users if not one.phase.is_terminal and one.name not in names]
+    shared = shared_nodes((one.name, one.node) for one in [*processes, *others])
     warnings = "".join(f". Warning: {one}" for one in shared)
     state.emit(Reply(event.request, message=f"{count(len(event.specs))} queued{warnings}"))
 
