@@ -38,6 +38,10 @@ Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of pr
 Array = Annotated[
     str, typer.Option("--array", metavar="NAME", help="Only jobs of this array, e.g. render.")
 ]
+Application = Annotated[
+    str,
+    typer.Option("--app", metavar="APP", help="Only processes of this application."),
+]
 Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host.")]
 
 

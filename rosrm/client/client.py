@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 from rosrm.client.connecting import connect, ros_settings, row_of, security_mode
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.errors import Refused
+from rosrm.model.applications import Target
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import ProcessSpec
 
@@ -19,11 +20,14 @@ if TYPE_CHECKING:
 
     from rosrm.client.logs import LogChunk, LogReader, LogSelection
     from rosrm.client.waiting import OnChange, Until, WaitResult
+    from rosrm.model.applications import ApplicationRow, ApplyResult
     from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
     from rosrm.ros.master_connection import MasterClient
 
 #: A work file by its path, a process as a work file has it, or a spec.
 Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]
+#: Path of a file.
+Path = Union[str, "os.PathLike[str]"]
 #: One name or several.
 Names = str | Iterable[str]
 #: Number of events in one listing that leaves out none, as in `List.srv`.
@@ -88,6 +92,48 @@ class Client:
             ConfigError: a file or a mapping is invalid; nothing was sent.
         """
         return self._master.submit(_specs(work))
+
+    def apply(self, work: Path | Iterable[Path], *, plan_only: bool = False) -> ApplyResult:
+        """Make applications as their work files describe them, all or none.
+
+        Args:
+            work: path of a work file with `app`, or several of these.
+            plan_only: True: return the actions that would follow, and begin none.
+
+        Raises:
+            ConfigError: a file is invalid, or has no application; nothing was sent.
+        """
+        from rosrm.config.work import load_application  # noqa: PLC0415 - imports pydantic
+
+        files = [work] if isinstance(work, (str, os.PathLike)) else list(work)
+        targets = [load_application(os.fspath(one)) for one in files]
+        return self.apply_targets(targets, plan_only=plan_only)
+
+    def apply_targets(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
+        """Make applications as their targets describe them, all or none; see `apply`."""
+        return self._master.apply(targets, plan_only=plan_only)
+
+    def revert(self, application: str, version: int, *, plan_only: bool = False) -> ApplyResult:
+        """Make an earlier version of an application the desired one again.
+
+        Args:
+            application: its name.
+            version: number of the version.
+            plan_only: True: return the actions that would follow, and begin none.
+        """
+        return self._master.apply([Target(application, version=version)], plan_only=plan_only)
+
+    def cancel_application(self, application: str) -> ApplyResult:
+        """Cancel all processes of an application; its versions stay."""
+        return self._master.apply([Target(application)])
+
+    def list_applications(self) -> Sequence[ApplicationRow]:
+        """Return all applications with their versions."""
+        return self.list(applications=True).applications
+
+    def get_application(self, name: str) -> ApplicationRow:
+        """Return an application; raise `Refused` for an unknown name."""
+        return row_of("application", name, {row.name: row for row in self.list_applications()})
 
     def cancel(self, processes: Names) -> str:
         """Take processes out of the queue, or stop them for good; return the master's message."""
@@ -156,8 +202,8 @@ class Client:
 
     def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
-        plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
-        host: str = "", after: int = 0, newest: int = 0,
+        plugins: bool | Literal["failing"] = False, applications: bool = False,
+        events: bool = False, process: str = "", host: str = "", after: int = 0, newest: int = 0,
         on_wait: Callable[[float], None] | None = None,
     ) -> Listing:  # fmt: skip
         """Return the requested listings; one request reads all of them.
@@ -166,6 +212,7 @@ class Client:
             hosts: True: list the hosts.
             processes: True: list the processes.
             plugins: True: list all plugins; "failing": only the failing ones.
+            applications: True: list the applications.
             events: True: list events, the oldest first.
             process: limit processes and events to this process; "": all.
             host: limit events to this host; "": all.
@@ -175,8 +222,8 @@ class Client:
                 since the request; an exception that it raises ends the request.
         """
         return self._master.list(
-            hosts=hosts, processes=processes, plugins=plugins, events=events, process=process,
-            host=host, after=after, newest=newest, on_wait=on_wait,
+            hosts=hosts, processes=processes, plugins=plugins, applications=applications,
+            events=events, process=process, host=host, after=after, newest=newest, on_wait=on_wait,
         )  # fmt: skip
 
     def list_processes(self) -> Sequence[ProcessRow]:
@@ -330,6 +377,27 @@ class Client:
             notify=self._notify,
         )  # fmt: skip
 
+    def wait_for_applications(
+        self, names: Names, *, timeout: float | None = None,
+        on_change: Callable[[ApplicationRow], None] | None = None,
+    ) -> Sequence[ApplicationRow]:  # fmt: skip
+        """Wait until no process of the applications is to be changed; return the last rows.
+
+        Args:
+            names: of the applications.
+            timeout: seconds; None: no limit.
+            on_change: takes the row of an application with each change of its pending processes.
+
+        Raises:
+            NoMaster: the master was silent when the time-out passed.
+        """
+        from rosrm.client import waiting  # noqa: PLC0415 - for those who wait
+
+        return waiting.wait_for_applications(
+            self._master, _list(names), timeout=timeout, on_change=on_change or _ignore,
+            notify=self._notify,
+        )  # fmt: skip
+
     def wait_for_drain(
         self, host: str, *, after: int, timeout: float | None = None
     ) -> WaitResult:  # fmt: skip
@@ -358,7 +426,7 @@ class Client:
         self.close()
 
 
-def _ignore(row: ProcessRow) -> None:
+def _ignore(_row: object) -> None:
     """Take a change that no caller wants."""
 
 

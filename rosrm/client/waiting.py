@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
+from rosrm.model.applications import ApplicationRow
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow, ProcessRow
 from rosrm.wording import standing
@@ -116,6 +117,34 @@ def wait_for_processes(
                 pending=[row.name for row in awaited], failed=failed, missing=missing,
                 processes=ours,
             )  # fmt: skip
+        time.sleep(PERIOD)
+
+
+def wait_for_applications(
+    master: MasterClient, names: Sequence[str], *, timeout: float | None,
+    on_change: Callable[[ApplicationRow], None], notify: Notify,
+) -> Sequence[ApplicationRow]:  # fmt: skip
+    """Watch applications until no process of them is to be changed; return the last rows.
+
+    Args:
+        master: to ask.
+        names: of the applications.
+        timeout: seconds; None: no limit.
+        on_change: takes a row with each change of its pending processes.
+        notify: takes a message when the master is silent.
+    """
+    deadline = deadline_after(timeout)
+    seen: dict[str, ApplicationRow] = {}
+    while True:
+        view = ask_until_answered(lambda: master.list(applications=True), notify, deadline)
+        rows = [row for row in view.applications if row.name in names]
+        for row in rows:
+            if row.pending and seen.get(row.name) != row:
+                on_change(row)
+            seen[row.name] = row
+        awaited = [row for row in rows if row.state in ("applying", "returning")]
+        if not awaited or time.monotonic() >= deadline:
+            return rows
         time.sleep(PERIOD)
 
 

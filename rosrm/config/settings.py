@@ -260,12 +260,14 @@ class JournalSettings:
         keep_events: number of the newest events that are not deleted.
         keep_bytes: most bytes of the events; refusals get a tenth of both bounds at most.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
+        keep_versions: number of the newest versions of each application that are kept.
     """
 
     sync: Literal["normal", "full"] = "normal"
     keep_events: PositiveCount = 100_000
     keep_bytes: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 200_000_000
     keep_ended: PositiveCount = _CORE.keep_ended
+    keep_versions: PositiveCount = _CORE.keep_versions
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,6 +371,7 @@ class ClusterConfig:
             rebalance_moves=self.rebalance.max_moves,
             order_retry=self.control.order_retry,
             keep_ended=self.journal.keep_ended,
+            keep_versions=self.journal.keep_versions,
             max_hosts=self.max_hosts,
             max_processes=self.queue.max_processes,
             quotas={

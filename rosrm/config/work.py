@@ -7,20 +7,22 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.config.checking import near, salvaged
+from rosrm.config.checking import described, near, salvaged, validated
 from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, about_retries, complaints
+from rosrm.config.rollout import RolloutInFile
 from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
 from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
+from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
-_SECTIONS: Final = ("processes", "defaults")
+_SECTIONS: Final = ("app", "rollout", "processes", "defaults")
 #: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach", "array", "parallel")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
@@ -38,7 +40,25 @@ def load_work(path: str | Path, registry: Registry | None = None) -> tuple[Proce
         registry: the installed plugins, for a check of the migration strategies; None: only the
             master checks them.
     """
-    return checked_work(read(path), path, registry)
+    return checked_work(read(path), path, registry).specs
+
+
+def load_application(path: str | Path, registry: Registry | None = None) -> Target:
+    """Read the application of a file; otherwise as `load_work`.
+
+    A file without `app` is refused.
+    """
+    root = read(path)
+    target = checked_work(root, path, registry)
+    if not target.application:
+        problems = Problems()
+        problems.add(
+            root.place,
+            "app: the name of the application is required, such as `app: navigation`. To run "
+            "single processes, use `rosrm submit`",
+        )
+        problems.raise_any()
+    return target
 
 
 def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
@@ -47,17 +67,16 @@ def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
     Relative paths start at the current directory. Raises one `ConfigError` with all problems.
     """
     if "processes" in work:
-        return checked_work(node_of(work, Place("work", 0, 0)), "work", None)
+        return checked_work(node_of(work, Place("work", 0, 0)), "work", None).specs
     place = Place(f"process {work.get('name')!r}", 0, 0)
-    return checked_work(node_of({"processes": [work]}, place), "work", None)
+    return checked_work(node_of({"processes": [work]}, place), "work", None).specs
 
 
-def checked_work(
-    root: Node, path: str | Path, registry: Registry | None
-) -> tuple[ProcessSpec, ...]:
-    """Return the processes of a parsed document; otherwise as `load_work`."""
+def checked_work(root: Node, path: str | Path, registry: Registry | None) -> Target:
+    """Return the processes of a parsed document, and its application; otherwise as `load_work`."""
     problems = Problems()
     check_kind(root, "work")
+    application, rollout = _application(root, problems)
     entries = _entries(root, problems)
     defaults = _defaults(root, problems)
     plugins = PluginCheck(registry, problems)
@@ -69,7 +88,26 @@ def checked_work(
     specs = [_process(node, path, plugins, problems) for node in nodes]
     refuse_namesakes(nodes, "process", problems)
     problems.raise_any()
-    return tuple(spec for spec in specs if spec is not None)
+    parts = tuple(replace(spec, application=application) for spec in specs if spec is not None)
+    return Target(application, parts, rollout=rollout)
+
+
+def _application(root: Node, problems: Problems) -> tuple[str, RolloutPolicy]:
+    """Return the name of the application, "" for none, and the way of its replacement."""
+    app, rollout = root.get("app"), root.get("rollout")
+    if app is not None and not isinstance(app.value, str):
+        problems.add(app.place, f"app: a name is required, not {described(app.plain())}")
+    check_name(app, "application", problems)
+    if rollout is None:
+        return _text_of(app), RolloutPolicy()
+    if app is None:
+        problems.add(rollout.key_place or rollout.place, "rollout: goes with `app: NAME` only")
+    checked = validated(RolloutInFile, rollout, problems, "rollout")
+    return _text_of(app), checked.policy() if checked is not None else RolloutPolicy()
+
+
+def _text_of(node: Node | None) -> str:
+    return node.value if node is not None and isinstance(node.value, str) else ""
 
 
 def _entries(root: Node, problems: Problems) -> Sequence[Node]:

@@ -8,10 +8,12 @@ from dataclasses import replace
 from typing import Any, Final
 
 from rosrm.core.master import listing
+from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.master.disclosure import disclosed
+from rosrm.model.applications import ApplicationRow
 from rosrm.model.records import StoredRecord
 from rosrm.model.requester import Requester
 from rosrm.model.rows import EventRow, Listing, PluginRow, ProcessRow
@@ -61,6 +63,7 @@ class MasterQueries:
             processes=self._processes(request.process, now, by) if request.processes else (),
             plugins=self._plugin_rows(request) if request.plugins else (),
             events=self._events(request, by) if request.events else (),
+            applications=self._applications(by) if request.applications else (),
         )
 
     def _processes(self, name: str, now: float, by: Requester) -> list[ProcessRow]:
@@ -72,6 +75,12 @@ class MasterQueries:
         return [
             row if by.may_act_on(row.owner) else replace(row, reason=first_line(row.reason))
             for row in rows
+        ]
+
+    def _applications(self, by: Requester) -> list[ApplicationRow]:
+        return [
+            row if by.may_act_on(row.owner) else replace(row, pending={}, reason="", versions=())
+            for row in application_rows(self._state)
         ]
 
     def _events(self, request: Any, by: Requester) -> list[EventRow]:

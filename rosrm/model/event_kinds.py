@@ -71,6 +71,16 @@ class EventKind(str, Enum):
     SEPARATED = "separated", "the process no longer runs near another one, with the reason"
     PREEMPTED = "preempted", "the process makes room for one of a higher priority; facts: for, host"
 
+    REPLACED = "replaced", "the process is stopped, and starts again in a new version"
+
+    # --- applications --------------------------------------------------------------------
+
+    APPLICATION_REQUESTED = "application_requested", "a client requests a version of an application"
+    APPLICATION_APPLIED = "application_applied", "all processes of the application are as desired"
+    APPLICATION_FAILED = "application_failed", "a process of the application fails, with the reason"
+    APPLICATION_RETURNS = "application_returns", "a version failed: the former one is applied again"
+    APPLICATION_CANCELLED = "application_cancelled", "all processes of the application have ended"
+
     # --- hosts ---------------------------------------------------------------------------
 
     HOST_REGISTERED = "host_registered", "a host registered; facts: labels, resources and devices"

@@ -32,6 +32,8 @@ class Move:
         source_node: name of the source's node: an alias, if a handoff started it.
         options: options of the strategy for this process: those of the cluster, overridden by those
             of the process; an object of the offer's `own_options` or `options`.
+        new_spec: spec of the destination, if the process is replaced by another version of it;
+            None: the destination has the spec of the source.
     """
 
     spec: ProcessSpec
@@ -43,6 +45,12 @@ class Move:
     now: int
     source_node: str
     options: Any = None
+    new_spec: ProcessSpec | None = None
+
+    @property
+    def destination_spec(self) -> ProcessSpec:
+        """Return the spec of the destination."""
+        return self.spec if self.new_spec is None else self.new_spec
 
 
 class Aim(str, Enum):

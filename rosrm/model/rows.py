@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from rosrm.model.applications import ApplicationRow
 from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, HostDescription
 
@@ -90,6 +91,7 @@ class ProcessRow:
         reason: why it waits, failed, ...
         stale: `cpu` and `memory` are old, because its host is silent or lost.
         owner: principal that submitted it, "user:ada"; "": unknown.
+        application: application of which it is a part; "": it is a single process.
         cpu_limit: cores that its host enforces; 0: no limit holds.
         memory_limit: bytes that its host enforces; 0: no limit holds.
         array: name of its array; "": none.
@@ -113,6 +115,7 @@ class ProcessRow:
     reason: str
     stale: bool = False
     owner: str = ""
+    application: str = ""
     cpu_limit: float = 0.0
     memory_limit: int = 0
     array: str = ""
@@ -175,6 +178,7 @@ class Listing:
     processes: Sequence[ProcessRow] = ()
     plugins: Sequence[PluginRow] = ()
     events: Sequence[EventRow] = ()
+    applications: Sequence[ApplicationRow] = ()
     trouble: str = ""
     security: str = "keys"
     strangers: str = ""

@@ -276,6 +276,7 @@ class ProcessSpec:
         devices: devices that it holds while it runs, each kind once.
         array: the array of a job, and its index there.
         schedule: times at which a job starts again.
+        application: name of the application of which it is a part; "": it is a single process.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -318,6 +319,7 @@ class ProcessSpec:
     devices: tuple[DeviceNeed, ...] = ()
     array: ArrayMembership = NO_ARRAY
     schedule: Schedule = NO_SCHEDULE
+    application: str = ""
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

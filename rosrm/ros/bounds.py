@@ -32,6 +32,8 @@ _OTHER_LETTERS: Final = {
     "ControlHost_Request.arguments": 1 << 20,
     "ControlHost_Response.result": 1 << 20,
     "Explain_Response.explanation": 1 << 24,
+    "Apply_Response.actions": 1 << 24,
+    "List_Response.application_list": 1 << 24,
 }
 _OTHER_ENTRIES: Final = {
     "Assignment.state_key": 32,
@@ -64,6 +66,8 @@ _OTHER_ENTRIES: Final = {
     "ProcessUsage.others": 16,
     "Sealed.body": 1 << 24,
     "Submit_Request.processes": 10_000,
+    "Apply_Request.targets": 1000,
+    "ApplicationTarget.processes": 10_000,
     "List_Response.process_list": 1 << 20,
     "List_Response.plugin_list": 1 << 20,
     "StoreReplica_Request.data": 1 << 20,

@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
+from rosrm.model.applications import OnFailure, RolloutPolicy, Target
 from rosrm.model.description_checks import (
     description_fault,
     is_namespace,
@@ -198,6 +199,38 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     return spec
 
 
+def target_to_msg(target: Target) -> msg.ApplicationTarget:
+    """Return the desired state of an application as a message."""
+    return msg.ApplicationTarget(
+        application=target.application, version=target.version,
+        processes=[spec_to_msg(spec) for spec in target.specs],
+        max_parallel=target.rollout.max_parallel,
+        healthy_for=float(target.rollout.healthy_for), on_failure=target.rollout.on_failure,
+    )  # fmt: skip
+
+
+def target_from_msg(message: msg.ApplicationTarget) -> Target:
+    """Return the inverse of `target_to_msg`; raises `Refused` for an invalid target."""
+    fault = name_fault(message.application, "application") or _rollout_fault(message)
+    if fault:
+        raise Refused(fault)
+    specs = tuple(spec_from_msg(spec) for spec in message.processes)
+    rollout = RolloutPolicy(message.max_parallel, message.healthy_for, message.on_failure)
+    return Target(message.application, specs, message.version, rollout)
+
+
+def _rollout_fault(message: msg.ApplicationTarget) -> str:
+    application, allowed = message.application, get_args(OnFailure)
+    if message.max_parallel < 1:
+        return f"{application}: max_parallel is {message.max_parallel}; allowed: 1 or more"
+    if not 0.0 <= message.healthy_for <= LONGEST:
+        return f"{application}: healthy_for is {message.healthy_for}; allowed: 0 to {LONGEST:g} s"
+    if message.on_failure not in allowed:
+        given = f"on_failure is {message.on_failure!r:.100}"
+        return f"{application}: {given}; allowed: {', '.join(allowed)}"
+    return ""
+
+
 def _spec_fault(message: msg.ProcessSpec) -> str:
     """Return a fault that rosrm's own clients would not send, though others might; "": none."""
     fault = _name_fault(message) or _size_fault(message)
@@ -222,6 +255,8 @@ def _name_fault(message: msg.ProcessSpec) -> str:
     namespace = message.ros_namespace
     if namespace and not is_namespace(namespace):
         return f"{namespace!r:.250} is not an absolute namespace such as '/robot1'"
+    if message.application and (fault := name_fault(message.application, "application")):
+        return fault
     return name_fault(message.name, "process")
 
 

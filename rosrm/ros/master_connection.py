@@ -14,6 +14,8 @@ from rosrm.errors import NoMaster, Refused
 from rosrm.keys.finding import user_security
 from rosrm.keys.roles import SecurityMode
 from rosrm.keys.security import Member
+from rosrm.model.applications import ApplicationRow, ApplyResult, PlannedAction, Target
+from rosrm.model.codec import from_plain
 from rosrm.model.orders import CHECK_TIMEOUT
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
@@ -268,6 +270,15 @@ class MasterClient:
             srv.Submit, names.SUBMIT, processes=[convert.spec_to_msg(spec) for spec in specs]
         )
 
+    def apply(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
+        """Make applications as desired, or return the plan of that."""
+        answer = self._request(
+            srv.Apply, names.APPLY, targets=[convert.target_to_msg(one) for one in targets],
+            plan_only=plan_only,
+        )  # fmt: skip
+        actions = from_plain(tuple[PlannedAction, ...], json.loads(answer.actions))
+        return ApplyResult(str(answer.answer.message), actions)
+
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""
         _spin(self._participant, timeout)
@@ -313,8 +324,9 @@ class MasterClient:
 
     def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
-        plugins: bool | Literal["failing"] = False, events: bool = False, process: str = "",
-        host: str = "", after: int = 0, newest: int = 0, on_wait: OnWait | None = None,
+        plugins: bool | Literal["failing"] = False, applications: bool = False,
+        events: bool = False, process: str = "", host: str = "", after: int = 0, newest: int = 0,
+        on_wait: OnWait | None = None,
     ) -> Listing:  # fmt: skip
         """Return the requested listings; `plugins="failing"` limits plugins to failing ones.
 
@@ -323,8 +335,9 @@ class MasterClient:
         """
         request = srv.List.Request(
             protocol_version=PROTOCOL_VERSION, hosts=hosts, processes=processes,
-            plugins=bool(plugins), failing=plugins == "failing", events=events, process=process,
-            host=host, after_sequence=after, max_events=newest,
+            plugins=bool(plugins), failing=plugins == "failing", events=events,
+            applications=applications, process=process, host=host, after_sequence=after,
+            max_events=newest,
         )  # fmt: skip
         answer = self._call(srv.List, names.LIST, request, on_wait=on_wait)
         return Listing(
@@ -333,6 +346,9 @@ class MasterClient:
             hosts=[convert.host_row_from_msg(row) for row in answer.host_list],
             processes=[convert.process_row_from_msg(row) for row in answer.process_list],
             plugins=[convert.plugin_row_from_msg(row) for row in answer.plugin_list],
+            applications=from_plain(
+                tuple[ApplicationRow, ...], json.loads(answer.application_list)
+            ),
             events=[convert.event_from_msg(row) for row in answer.event_list],
         )  # fmt: skip
 
@@ -379,7 +395,11 @@ class MasterClient:
         return self._control.envelope(self._master.beat, self._master.epoch)
 
     def _ask(self, kind: Any, name: str, *, patience: float = 0.0, **fields: Any) -> str:
-        """Send a request that acts, and return the master's message.
+        """Send a request that acts, and return the master's message; see `_request`."""
+        return str(self._request(kind, name, patience=patience, **fields).answer.message)
+
+    def _request(self, kind: Any, name: str, *, patience: float = 0.0, **fields: Any) -> Any:
+        """Send a request that acts, and return the answer.
 
         `patience`: seconds for the answer, if more than for other requests.
         """
@@ -387,7 +407,7 @@ class MasterClient:
         for is_repeated in (False, True):
             request.envelope = self._envelope()
             try:
-                return str(self._call(kind, name, request, patience).answer.message)
+                return self._call(kind, name, request, patience)
             except Refused as refusal:
                 if is_repeated or refusal.code != "stale":
                     raise

@@ -168,10 +168,11 @@ def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
 
 
 def _start(move: Move, options: HandoffOptions) -> Start:
-    stop = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
+    started = move.destination_spec
+    stop = Stop(move.destination, move.destination_host, started.stop.timeout)
     return Start(
         move.destination, move.destination_host, options.start_timeout, alias_of(move), undo=stop,
-        shadow=True, remappings=_own_names(move.spec, options),
+        shadow=True, remappings=_own_names(started, options),
     )  # fmt: skip
 
 
@@ -193,8 +194,9 @@ def _suspend(move: Move, options: HandoffOptions) -> SetRestart:
 
 def _give_restart_policy(move: Move, options: HandoffOptions) -> SetRestart:
     return SetRestart(
-        move.destination, move.destination_host, move.spec.restart, options.start_timeout
-    )
+        move.destination, move.destination_host, move.destination_spec.restart,
+        options.start_timeout,
+    )  # fmt: skip
 
 
 def _end(move: Move, options: HandoffOptions) -> tuple[Stop, Configure]:

@@ -41,8 +41,9 @@ class Relaunch:
 
 
 def _start_first(move: Move, options: RelaunchOptions) -> Plan:
-    settle = options.settle if move.spec.ros else 0.0
-    ready, stop = move.spec.readiness.timeout + settle, move.spec.stop.timeout
+    started = move.destination_spec
+    settle = options.settle if started.ros else 0.0
+    ready, stop = started.readiness.timeout + settle, move.spec.stop.timeout
     return Plan(
         (
             Start(
@@ -68,11 +69,13 @@ def _stop_first(move: Move, start_timeout: float) -> Plan:
                 move.destination, move.destination_host, start_timeout,
                 undo=_stop_destination(move),
             ),
-            AwaitReady(move.destination, move.destination_host, move.spec.readiness.timeout),
+            AwaitReady(
+                move.destination, move.destination_host, move.destination_spec.readiness.timeout
+            ),
             Commit(),
         ),
     )  # fmt: skip
 
 
 def _stop_destination(move: Move) -> Stop:
-    return Stop(move.destination, move.destination_host, move.spec.stop.timeout)
+    return Stop(move.destination, move.destination_host, move.destination_spec.stop.timeout)

@@ -19,7 +19,18 @@ from typing import Annotated, Any
 
 import typer
 
-from rosrm.cli.commands import change, check, follow, inspect, key, plugin, run, runtimes, up
+from rosrm.cli.commands import (
+    applications,
+    change,
+    check,
+    follow,
+    inspect,
+    key,
+    plugin,
+    run,
+    runtimes,
+    up,
+)
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
 from rosrm.cli.installed_commands import find_commands, load_command
 from rosrm.cli.options import CommonOptions, Domain
@@ -113,7 +124,7 @@ def common(
     ctx.obj = CommonOptions(domain, cluster)
 
 
-for module in (up, runtimes, change, inspect, follow):
+for module in (up, runtimes, applications, change, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
 app.command(cls=PlainCommand, context_settings={"allow_interspersed_args": False})(run.run)

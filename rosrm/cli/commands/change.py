@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import Array, Domain, Host, Name, Names
+from rosrm.cli.options import Application, Array, Domain, Host, Name, Names
 from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 from rosrm.wording import counted
@@ -77,6 +77,7 @@ def cancel(
         bool, typer.Option("--all", help="All processes that have not ended.")
     ] = False,
     array: Array = "",
+    application: Application = "",
     *,
     wait: Wait = False,
     timeout: Timeout = "",
@@ -84,34 +85,42 @@ def cancel(
 ) -> None:
     """Cancel processes: remove them from the queue, or stop them for good.
 
-    For a work file, all its processes that have not ended are cancelled.
+    For a work file, all its processes that have not ended are cancelled. A cancelled application
+    keeps its versions: `rosrm revert APP` makes one of them the desired one again.
     """
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
     from rosrm.client.connecting import check_name
     from rosrm.client.waiting import ENDED
 
     limit, chosen = longest(timeout), words or []
-    if [everything, bool(array), bool(chosen)].count(True) != 1:
-        raise ConfigError("cancel: give names of processes or work files, --array NAME, or --all")
+    if [everything, bool(array), bool(application), bool(chosen)].count(True) != 1:
+        raise ConfigError(
+            "cancel: give names of processes or work files, --array NAME, --app NAME, or --all"
+        )
     named = [word for word in chosen if not _is_file(word)]
-    filed = [name for word in chosen if _is_file(word) for name in _names_in(word)]
+    filed = {name for word in chosen if _is_file(word) for name in _names_in(word)}
     with connection.master(ctx, domain) as client:
-        if everything or array or filed:
+        if application:
+            echo(client.cancel_application(application).message)
+        if everything or array or filed or application:
             rows = client.list_processes()
             check_name("array", array, {row.array for row in rows if row.array})
             live = [row for row in rows if row.state not in ENDED]
             named += [
                 row.name for row in live
                 if everything or row.name in filed or (array and row.array == array)
+                or (application and row.application == application)
             ]  # fmt: skip
         names = list(dict.fromkeys(named))
-        if not names:
+        outcome = ""
+        if not names and not application:
             echo("no process to cancel: all of them have ended, or were never submitted")
             return
-        outcome = client.cancel(names)
-        echo(outcome)
+        if not application:
+            outcome = client.cancel(names)
+            echo(outcome)
         # If all processes were still queued, the master's reply reports their end already.
-        if wait and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
+        if wait and names and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":
             with interruptible("the processes are still being cancelled (`rosrm ps`)"):
                 show_processes(
                     client.wait(names, until="ended", timeout=limit, on_change=show_change)

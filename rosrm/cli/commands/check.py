@@ -149,7 +149,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
         case _:
             for warning in _misspelt_needs(root, registry):  # also for a wrong file
                 echo(warning, err=True)
-            specs = checked_work(root, file, registry)
+            specs = checked_work(root, file, registry).specs
             for warning in shared_nodes((spec.name, node_of(spec)) for spec in specs):
                 echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)

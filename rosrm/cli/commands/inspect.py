@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import Array, AsJson, Domain, Name
+from rosrm.cli.options import Application, Array, AsJson, Domain, Name
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 
@@ -39,6 +39,7 @@ def ps(
         str, typer.Option("--host", metavar="HOST", help="List only processes on this host.")
     ] = "",
     array: Array = "",
+    application: Application = "",
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
@@ -46,13 +47,16 @@ def ps(
     from rosrm.cli.output import arrays, json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        snapshot = client.list(processes=True, hosts=bool(host))
+        snapshot = client.list(processes=True, hosts=bool(host), applications=bool(application))
     connection.print_trouble(snapshot)
     check_name("host", host, [row.description.name for row in snapshot.hosts])
     check_name("array", array, {row.array for row in snapshot.processes if row.array})
+    check_name("application", application, [row.name for row in snapshot.applications])
     shown = [row for row in snapshot.processes if not host or row.host == host]
     if array:
         shown = [row for row in shown if row.array == array]
+    if application:
+        shown = [row for row in shown if row.application == application]
     if as_json:
         forms = json_forms.forms(shown)
         json_forms.show(arrays.form(array, shown, forms) if array else forms)

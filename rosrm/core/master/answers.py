@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import reloading
+from rosrm.core.master.applications import restart_policies
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.master_state import MasterState
@@ -16,6 +17,7 @@ from rosrm.core.master.state.pending_orders import (
     PeriodicCheckpoint,
     Reload,
     Replication,
+    RestartPolicyChange,
 )
 
 
@@ -27,6 +29,8 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             return
         case MigrationStep(process):
             steps.note_answer(state, process, event)
+        case RestartPolicyChange():
+            restart_policies.note_answer(state, purpose, event)
         case Replication(process):
             replication.note_answer(state, process, event)
         case CapabilityQuery():

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from rosrm.model.applications import PlannedAction
 from rosrm.model.orders import Order, StartInstance, StopInstance
 from rosrm.model.plan import HandoffPhase
 from rosrm.model.records import Intent, Record
@@ -99,7 +100,11 @@ class ReadSettings:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """Answer a request that came with an event; `code` is "" unless the request is refused."""
+    """Answer a request that came with an event; `code` is "" unless the request is refused.
+
+    Attributes:
+        actions: actions that follow, or would follow, on the processes of applications.
+    """
 
     request: int
     accepted: bool = True
@@ -107,6 +112,7 @@ class Reply:
     message: str = ""
     host_id: int = 0
     host: str = ""
+    actions: tuple[PlannedAction, ...] = ()
 
 
 Command = (

@@ -17,6 +17,7 @@ from rosrm.core.master.commands import OrderId
 from rosrm.core.master.settings import CoreSettings
 from rosrm.extensions.placement import PolicySettings
 from rosrm.extensions.plugin_calls import Plugin
+from rosrm.model.applications import Target
 from rosrm.model.devices import Device
 from rosrm.model.plan import ReportPhase
 from rosrm.model.requester import OPERATOR, Requester
@@ -173,6 +174,20 @@ class SubmissionReceived:
 
     request: int
     specs: tuple[ProcessSpec, ...]
+    by: Requester = OPERATOR
+
+
+@dataclass(frozen=True, slots=True)
+class ApplicationsRequested:
+    """A client requests versions of applications, or cancels applications: all, or none.
+
+    Attributes:
+        plan_only: True: the reply has the actions that would follow, and none begins.
+    """
+
+    request: int
+    targets: tuple[Target, ...]
+    plan_only: bool = False
     by: Requester = OPERATOR
 
 
@@ -382,6 +397,7 @@ class TimePassed:
 
 ClientRequest = (
     SubmissionReceived
+    | ApplicationsRequested
     | CancelRequested
     | RestartRequested
     | MigrationRequested

@@ -81,7 +81,7 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     if place == "after a gap":
         state.send(host, ReportInstances())
     for status in event.statuses:
-        _take_status(state, host, status, now)
+        take_status(state, host, status, now)
 
 
 def reconcile(
@@ -96,7 +96,7 @@ def reconcile(
     held = {status.instance: status for status in statuses}
     state.skip_numbers(max((one.number for one in held), default=0))
     for status in held.values():
-        _take_status(state, host, status, now)
+        take_status(state, host, status, now)
     for instance in state.instances_of(host):
         if instance.id in held:
             continue
@@ -125,7 +125,7 @@ def _note_load(
         settle_reservation(state, instance, now)
 
 
-def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
+def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
     if instance is None or instance.host is not host or instance.id != status.instance:
@@ -208,7 +208,7 @@ def _handle_unknown_instance(
     The master tracks it until it has ended: it repeats the order to stop, and starts no successor.
     """
     if readoption.readopt(state, host, status, now):
-        _take_status(state, host, status, now)
+        take_status(state, host, status, now)
         return
     if status.state.ended or status.instance.number >= max(LARGEST_NUMBER, state.next_instance):
         return

@@ -110,6 +110,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
         cpu_limit=_limit(process, owner, "cpu"), memory_limit=int(_limit(process, owner, "memory")),
         stale=silence is not None, owner=process.principal, array=process.spec.array.name,
         next_run=0.0 if process.phase.is_terminal else process.next_run,
+        application=process.spec.application,
     )  # fmt: skip
 
 

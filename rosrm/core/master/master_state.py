@@ -11,16 +11,20 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.core.master.commands import Command, OrderId, SendOrder
+from rosrm.core.master.graph_names import node_of
 from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
+from rosrm.core.master.state import applications
+from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.flows import Flows
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
+from rosrm.core.master.state.lazy import Plain
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration, migration_to_dict
@@ -90,7 +94,10 @@ class MasterState:
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
         scheduled: names of the processes with a schedule that are not terminal.
+        applications: by name.
         terminal: names of the terminal processes, in the order in which they ended.
+        unamended: name of each process whose slave does not know its new restart policy yet, to the
+            time of the last order.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
             of submission, because a replay must begin them in the same order.
@@ -104,7 +111,7 @@ class MasterState:
         plugins: guards every call of a plugin.
     """
 
-    def __init__(
+    def __init__(  # noqa: PLR0915 - a statement for each part of the state
         self,
         settings: CoreSettings,
         placement: PlacementPlugins,
@@ -121,6 +128,7 @@ class MasterState:
         self.hosts = HostTable()
         self.queue = Queue()
         self.processes: dict[str, Process] = {}
+        self.applications: dict[str, Application] = {}
         self.terminal: dict[str, None] = {}
         self.instances: dict[int, Instance] = {}
         self.migrations: dict[str, Migration] = {}
@@ -132,6 +140,7 @@ class MasterState:
         self.flows = Flows()
         self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
+        self.unamended: dict[str, float] = {}
         self.time_limited: dict[str, None] = {}
         self.scheduled: dict[str, None] = {}
         self.preemption = Preemption()
@@ -163,6 +172,7 @@ class MasterState:
         self._out: list[Command] = []
         self._unsaved: dict[str, Process] = {}
         self._unsaved_migrations: dict[str, Migration] = {}
+        self._unsaved_applications: dict[str, Application] = {}
 
     # --- commands ------------------------------------------------------------------------
 
@@ -178,6 +188,10 @@ class MasterState:
         for migration in self._unsaved_migrations.values():
             self._out.append(self._intent_of_migration(migration))
         self._unsaved_migrations.clear()
+        for name, application in self._unsaved_applications.items():
+            plain = applications.application_to_dict(application)
+            self._out.append(Intent("application", name, plain))
+        self._unsaved_applications.clear()
         out, self._out = self._out, []
         return out
 
@@ -229,7 +243,8 @@ class MasterState:
         return Intent(
             "process", process.name,
             {
-                "spec": process.plain, "phase": phase.value, "since": began,
+                "spec": process.plain, "next_spec": to_plain(process.next_spec),
+                "phase": phase.value, "since": began,
                 "host": owner.host.name if owner else process.ended_on, "instances": held,
                 "node_names": aliases, "devices": devices,
                 "standby": standby and migration_to_dict(standby, ()),
@@ -238,6 +253,7 @@ class MasterState:
                 **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
                 "excluded": dict(process.excluded),
                 "failed_on": process.failed_on and to_plain(process.failed_on),
+                "amended": process.name not in self.unamended,
             },
         )  # fmt: skip
 
@@ -259,6 +275,19 @@ class MasterState:
         numbers = sorted(self.processes[migration.process].instances)
         stopping = [number for number in numbers if self.instances[number].stopping]
         return Intent("migration", migration.process, migration_to_dict(migration, stopping))
+
+    def save_application(self, application: Application) -> None:
+        """Persist the desired version and the tasks of an application."""
+        self._unsaved_applications[application.name] = application
+
+    def save_version(self, application: Application, version: Version) -> None:
+        """Persist a version of an application, and drop the oldest ones."""
+        application.versions[version.number] = version
+        key_of = applications.key_of
+        plain = applications.version_to_dict(version)
+        self.emit(Intent("version", key_of(application.name, version.number), plain))
+        for dropped in application.keep(self.settings.keep_versions):
+            self.emit(Intent("version", key_of(application.name, dropped), None))
 
     def send(self, host: Host, order: Order, purpose: Purpose | None = None) -> OrderId:
         """Send an order to the slave of a host and return its id.
@@ -335,6 +364,22 @@ class MasterState:
             self.neighbours.remove(process.name)
             self.flows.remove(process.name)
 
+    def set_spec(self, process: Process, spec: ProcessSpec) -> None:
+        """Replace the spec of a process, and note what other parts of the state read of it."""
+        in_line = process.name in self.queue or process.name in self.queue.arrays
+        if in_line:
+            self.unqueue(process)
+        process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
+        process.demand = None
+        self.wants_standby.pop(process.name, None)
+        self.time_limited.pop(process.name, None)
+        self.scheduled.pop(process.name, None)
+        self.neighbours.remove(process.name)
+        self._update_terminal(process)
+        if in_line:
+            self.put_in_queue(process)
+        self.save(process)
+
     def collect_garbage(self) -> None:
         """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
         excess = len(self.terminal) - self.settings.keep_ended
@@ -370,6 +415,9 @@ class MasterState:
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place, given by its priority and order of submission."""
+        if process.next_spec is not None:
+            self.set_spec(process, process.next_spec)
+            process.next_spec = None
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue = DesiredState.RUN, False
         process.started_at, process.began = inf, 0.0
@@ -404,6 +452,13 @@ class MasterState:
             self.queue.remove(process.name)
         self.queue.arrays.remove(process)
         self.set_aside.discard(process.name)
+
+    def names_of(self, application: str) -> list[str]:
+        """Return the names of the processes of an application, also of ended ones."""
+        return [
+            name for name, process in self.processes.items()
+            if process.spec.application == application
+        ]  # fmt: skip
 
     def instances_of(self, owner: Process | Host) -> list[Instance]:
         """Return every instance of a process, or on a host, that may still run."""

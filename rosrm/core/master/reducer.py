@@ -12,6 +12,7 @@ StatusesReceived        moves processes through their phases; drives migrations
 UsagesReceived          lowers reservations by the usage that readings now show
 SnapshotsReported       replaces the known snapshots and replicas of a host
 SubmissionReceived      queues all submitted processes, or refuses all; places queued processes
+ApplicationsRequested   makes versions of applications the desired ones, or plans that
 CancelRequested         removes processes from the queue, or stops them
 RestartRequested        restarts running processes in place, or queues ended ones again
 MigrationRequested      begins a migration
@@ -48,6 +49,7 @@ from rosrm.core.master import (
     tick,
 )
 from rosrm.core.master import events as happened
+from rosrm.core.master.applications import requests as application_requests
 from rosrm.core.master.assignment.assign import place_waiting
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import Command, Reply
@@ -72,6 +74,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.StatusesReceived: lifecycle.statuses_received,
         happened.AssignmentWithdrawn: lifecycle.assignment_withdrawn,
         happened.SubmissionReceived: requests.submission_received,
+        happened.ApplicationsRequested: application_requests.applications_requested,
         happened.CancelRequested: requests.cancel_requested,
         happened.RestartRequested: requests.restart_requested,
         happened.MigrationRequested: requests.migration_requested,

@@ -23,8 +23,8 @@ from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
 from rosrm.core.master.rescheduling import allow_every_host
 from rosrm.core.master.rights import check_rights
-from rosrm.core.master.scheduling.feasibility import unknown_resources
 from rosrm.core.master.schedules import await_first_run, queue_again
+from rosrm.core.master.scheduling.feasibility import unknown_resources
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -53,36 +53,22 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     """Queue all of the processes, or refuse all."""
     named = [state.processes[spec.name] for spec in event.specs if spec.name in state.processes]
     check_rights(named, event.by)
+    _refuse_parts(event.specs)
     taken = _taken(state, event)
     if taken:
         raise RequestRefused(f"{taken}. Nothing was queued", "name_taken")
     filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
     specs = [spec for spec, _ in filled]
-    fault = _submission_fault(state, filled) or neighbour_fault(state, specs)
+    fault = submission_fault(state, filled, len(filled)) or neighbour_fault(state, specs)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_quota(state, specs, event.by)
-    wall, born, first = state.wall, state.next_instance, state.next_order
-    processes = [
-        Process(
-            spec, order, ProcessPhase.QUEUED, now, event.by.name, wall=wall, born=born,
-            owned_from=_owned_from(state, spec.name, event.by), defaulted=defaulted,
-        )
-        for order, (spec, defaulted) in enumerate(filled, first)
-    ]  # fmt: skip
-    nodes = {process.node for process in processes}
+    processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
+    nodes, names = {one.node for one in processes}, {one.name for one in processes}
     users = [one for one in state.processes.values() if one.node in nodes]
-    live = [one for one in users if not one.phase.is_terminal]
-    doubts = shared_nodes((one.name, one.node) for one in [*processes, *live])
+    others = [one for one in users if not one.phase.is_terminal and one.name not in names]
+    doubts = shared_nodes((one.name, one.node) for one in [*processes, *others])
     doubts += unknown_resources(state.hosts, specs)
-    for process in processes:
-        state.next_order += 1
-        state.add_process(process)
-        if not await_first_run(state, process, now):
-            state.enqueue(process, now)
-        message = f"{process.name} was submitted"
-        state.record(now, EventKind.SUBMITTED, message, process=process.name, by=event.by)
-        state.save(process)
     warnings = "".join(f". Warning: {one}" for one in doubts)
     state.emit(Reply(event.request, message=f"{_accepted(processes)}{warnings}"))
 
@@ -95,6 +81,40 @@ def _accepted(processes: Sequence[Process]) -> str:
     waiting = f"{count(later)} {'waits' if later == 1 else 'wait'} for the first run"
     queued = len(processes) - later
     return f"{count(queued)} queued; {waiting}" if queued else waiting
+
+
+def add_process(
+    state: MasterState, spec: ProcessSpec, defaulted: tuple[str, ...], by: Requester, now: float
+) -> Process:
+    """Queue a new process; it replaces an ended one of its name.
+
+    Args:
+        defaulted: paths of the fields that have the cluster's defaults.
+        by: its owner from now on.
+    """
+    process = Process(
+        spec, state.next_order, ProcessPhase.QUEUED, now, by.name, wall=state.wall,
+        born=state.next_instance, owned_from=_owned_from(state, spec.name, by),
+        defaulted=defaulted,
+    )  # fmt: skip
+    state.next_order += 1
+    state.add_process(process)
+    if not await_first_run(state, process, now):
+        state.enqueue(process, now)
+    message = f"{process.name} was submitted"
+    state.record(now, EventKind.SUBMITTED, message, process=process.name, by=by)
+    state.save(process)
+    return process
+
+
+def _refuse_parts(specs: Sequence[ProcessSpec]) -> None:
+    """Refuse processes that are parts of an application, which only `apply` may change."""
+    names = dict.fromkeys(spec.application for spec in specs if spec.application)
+    if names:
+        raise RequestRefused(
+            f"these are processes of the application {listed(names)}: use `rosrm apply FILE`, or "
+            f"remove `app:` from the file. Nothing was queued"
+        )
 
 
 def _owned_from(state: MasterState, name: str, by: Requester) -> int:
@@ -154,14 +174,17 @@ def _still_stopping(state: MasterState, name: str) -> str:
     return f"an earlier {instance.id} is still being stopped on {instance.host.name}"
 
 
-def _submission_fault(
-    state: MasterState, submitted: Sequence[tuple[ProcessSpec, tuple[str, ...]]]
+def submission_fault(
+    state: MasterState, submitted: Sequence[tuple[ProcessSpec, tuple[str, ...]]], added: int
 ) -> str:
-    """Return why specs, each with the paths of its defaults, are refused; "": they are not."""
+    """Return why specs, each with the paths of its defaults, are refused; "": they are not.
+
+    `added`: number of those that are new processes.
+    """
     live, most = len(state.processes) - len(state.terminal), state.settings.max_processes
-    if live + len(submitted) > most:
+    if live + added > most:
         return (
-            f"{live} processes have not ended, and {len(submitted)} more would exceed "
+            f"{live} processes have not ended, and {added} more would exceed "
             f"`queue.max_processes` ({most})"
         )
     for spec, defaulted in submitted:
@@ -247,7 +270,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
     terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in processes:
         if not process.phase.is_terminal:
-            _cancel(state, process, now, event.by)
+            cancel_process(state, process, now, event.by)
     state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
 
 
@@ -269,7 +292,8 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
     return "; ".join(phrases)
 
 
-def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> None:
+def cancel_process(state: MasterState, process: Process, now: float, by: Requester) -> None:
+    """Remove a process from the queue, or stop it for good."""
     process.wanted, process.overdue = DesiredState.CANCEL, False
     state.clear_left_behind(process)
     state.record(

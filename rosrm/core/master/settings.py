@@ -45,6 +45,7 @@ class CoreSettings:
         rebalance_moves: most processes that move in one round.
         order_retry: seconds after which an unanswered order is repeated.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
+        keep_versions: number of the newest versions of each application that are kept.
         max_hosts: most hosts, also of those that left or are lost.
         max_processes: most processes that have not ended.
         quotas: limits by principal, or `DEFAULT_QUOTA`: "processes", and base units of
@@ -75,6 +76,7 @@ class CoreSettings:
     rebalance_moves: int = 4
     order_retry: float = 2.0
     keep_ended: int = 10_000
+    keep_versions: int = 5
     max_hosts: int = 2_000
     max_processes: int = 10_000
     quotas: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: EMPTY)

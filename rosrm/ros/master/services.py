@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from rosrm.errors import JournalError, Refused
 from rosrm.keys.roles import Principal, Role
 from rosrm.keys.security import Authority, Peer
 from rosrm.keys.tickets import TICKET_LIFE, Ticket
+from rosrm.model.codec import to_plain
 from rosrm.model.requester import Requester
 from rosrm.model.rows import Listing
 from rosrm.ros import convert, names
@@ -117,6 +119,7 @@ class MasterServices:
         for kind, name, event in (
             (srv.Leave, names.LEAVE, self._left),
             (srv.Submit, names.SUBMIT, _submitted),
+            (srv.Apply, names.APPLY, _applied),
             (srv.Cancel, names.CANCEL, _cancelled),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
@@ -171,6 +174,8 @@ class MasterServices:
         response = kind.Response(answer=answer)
         if kind is srv.Migrate:
             response.host = reply.host
+        elif kind is srv.Apply:
+            response.actions = json.dumps(to_plain(reply.actions))
         return response
 
     # --- slaves --------------------------------------------------------------------------
@@ -336,6 +341,7 @@ class MasterServices:
                 host_list=[convert.host_row_to_msg(row) for row in view.hosts],
                 process_list=[convert.process_row_to_msg(row) for row in view.processes],
                 plugin_list=[convert.plugin_row_to_msg(row) for row in view.plugins],
+                application_list=json.dumps(to_plain(tuple(view.applications))),
                 event_list=[convert.event_to_msg(row) for row in view.events],
             )
         )  # fmt: skip
@@ -369,6 +375,12 @@ def _submitted(request: srv.Submit.Request, token: int, peer: Peer) -> happened.
         zone = local_zone()
         specs = tuple(replace(spec, schedule=spec.schedule.in_zone(zone)) for spec in specs)
     return happened.SubmissionReceived(token, specs, _requester(peer))
+
+
+def _applied(request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:
+    targets = tuple(convert.target_from_msg(one) for one in request.targets)
+    by = _requester(peer)
+    return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
 
 
 def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -32,6 +33,7 @@ from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.placement import PlacementPlugins, ScoringLink, SelectedFilter
 from rosrm.extensions.registry import Registry
+from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.codec import to_plain
 from rosrm.model.orders import Order
 from rosrm.model.plan import (
@@ -320,6 +322,15 @@ class Cluster(World[Machine]):
 
     def submit(self, *specs: ProcessSpec) -> Reply:
         return self.ask(happened.SubmissionReceived, specs)
+
+    def apply(
+        self, name: str, *specs: ProcessSpec, version: int = 0, plan: bool = False, **rollout: Any
+    ) -> Reply:
+        """Request a version of an application: of these processes, or an earlier one; or none."""
+        parts = tuple(replace(spec, application=name) for spec in specs)
+        policy = RolloutPolicy(**{"healthy_for": 1.0, **rollout})
+        target = Target(name, parts, version, policy)
+        return self.ask(happened.ApplicationsRequested, (target,), plan)
 
     def with_processes(self, *specs: ProcessSpec) -> Self:
         """Submit processes, and return the cluster."""

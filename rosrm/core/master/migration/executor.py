@@ -152,10 +152,12 @@ def _commit(state: MasterState, migration: Migration, step: Commit, now: float) 
         image_requests.commit_to_image(state, process, migration, step)
     else:
         process.owner = migration.destination.number
+        if migration.spec is not None:
+            state.set_spec(process, migration.spec)
         state.note_change(process.name)
         images.set_image(state, process, None)
     state.clear_left_behind(process)  # a source on a lost host has a successor now
-    process.migrations += migration.aim is Aim.MOVE
+    process.migrations += migration.aim is Aim.MOVE and migration.spec is None
     process.moved_at = now
     if process.wanted is DesiredState.REQUEUE:
         process.wanted = DesiredState.RUN  # the requeue was meant for the source host
@@ -294,6 +296,8 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
     process = state.processes[migration.process]
     moved = migration.undo is None
     process.moved_at = now
+    if migration.spec is not None and not moved:
+        _note_not_replaced(state, process, migration)
     standby = state.standbys.get(migration.process)
     kept = {process.owner, standby.destination.number if standby else 0}
     for instance in state.instances_of(process):
@@ -320,6 +324,15 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
     if kind is EventKind.STAYED and process.decision and process.decision["kind"] == "migrated":
         process.decision = {**process.decision, "kind": kind}
     _settle_owner(state, process, migration, now)
+
+
+def _note_not_replaced(state: MasterState, process: Process, migration: Migration) -> None:
+    """Note why the new version of a process was not started in its place."""
+    application = state.applications.get(process.spec.application)
+    task = application.tasks.get(process.name) if application is not None else None
+    if application is not None and task is not None:
+        task.fault = migration.failure or "it was stopped"
+        state.save_application(application)
 
 
 def _settle_owner(state: MasterState, process: Process, migration: Migration, now: float) -> None:

@@ -19,7 +19,7 @@ from rosrm.extensions.plugin_calls import required
 from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, executors_of, plan_fault
-from rosrm.model.values import InstanceId
+from rosrm.model.values import InstanceId, ProcessSpec
 from rosrm.wording import get_close_matches, listed, standing
 
 #: Method of a strategy that returns the plan for each aim.
@@ -33,11 +33,15 @@ def begin_move(
     destination, cause = migration.destination_host, migration.cause
     state.migrations[process.name] = migration
     state.reserve(migration.destination, destination, now, ranking)
-    state.set_phase(process, ProcessPhase.MIGRATING, now, f"to {destination.name}: {cause}")
+    state.set_phase(process, ProcessPhase.MIGRATING, now, f"{migration.progress_text}: {cause}")
+    how = f"by {migration.strategy}: {cause}"
+    message = (
+        f"{process.name} moves from {migration.source_host.name} to {destination.name} {how}"
+        if migration.spec is None
+        else f"{process.name} is replaced on {destination.name} {how}"
+    )
     state.record(
-        now, EventKind.MIGRATION_BEGUN,
-        f"{process.name} moves from {migration.source_host.name} to {destination.name} by "
-        f"{migration.strategy}: {cause}",
+        now, EventKind.MIGRATION_BEGUN, message,
         process=process.name, host=destination.name,
         facts={
             "from": migration.source_host.name, "to": destination.name,
@@ -52,13 +56,17 @@ def begin_move(
 
 
 def plan_move(
-    state: MasterState, process: Process, destination: Host, cause: str, now: float
-) -> Migration | Rejected:
-    """Return the planned migration of a running process, or why there is no plan."""
+    state: MasterState, process: Process, destination: Host, cause: str, now: float,
+    new_spec: ProcessSpec | None = None,
+) -> Migration | Rejected:  # fmt: skip
+    """Return the planned migration of a running process, or why there is no plan.
+
+    `new_spec`: spec of the destination, if it is another version of the process.
+    """
     source = state.instances[process.owner]
     strategy, node = process.spec.migration.strategy or "", source.node_name or process.name
     move = move_of(state, process, source.id, source.host, destination, node)
-    return planned(state, strategy, move, cause, now)
+    return planned(state, strategy, replace(move, new_spec=new_spec), cause, now)
 
 
 def move_of(
@@ -87,6 +95,7 @@ def planned(
         move.spec.name, plan, strategy, move.source, hosts[move.source_host], move.destination,
         hosts[move.destination_host], cause, now, move.source_node, _destination_node(plan, move),
         state.wall, aim=aim, source_devices=source.devices if source else (),
+        spec=move.new_spec,
     )  # fmt: skip
 
 

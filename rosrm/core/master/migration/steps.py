@@ -131,7 +131,8 @@ def _order_of(
     if isinstance(step, Execute):
         return RunExecutor(step.executor, _arguments(migration, step), step.timeout)
     if isinstance(step, SetRestart):
-        if step.restart != state.processes[migration.process].spec.restart:
+        spec = migration.spec_of(step.instance, state.processes[migration.process].spec)
+        if step.restart != spec.restart:
             migration.suspended.add(step.instance.number)
             state.save_migration(migration)
         return SetRestartPolicy(step.instance, step.restart)
@@ -144,7 +145,7 @@ def _arguments(migration: Migration, step: Execute) -> Mapping[str, Any]:
 
 def _start(state: MasterState, migration: Migration, step: Start, now: float) -> StartInstance:
     process = state.processes[migration.process]
-    spec, number = process.spec, step.instance.number
+    spec, number = migration.spec_of(step.instance, process.spec), step.instance.number
     migration.launched.add(number)
     if step.shadow or step.restored:
         migration.suspended.add(number)

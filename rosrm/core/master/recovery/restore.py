@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import inf
 from typing import Any
 
 from rosrm.core.master.checkpoint import images
@@ -14,7 +15,7 @@ from rosrm.core.master.lifecycle import (
 )
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery import journal_gap
-from rosrm.core.master.state import migration
+from rosrm.core.master.state import applications, migration
 from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
 from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
@@ -46,6 +47,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
         state.learned.restore(program, amounts)
     removed = ((int(one["next"]), name) for name, one in intents("removed").items())
     state.replication.removed.update((name, end) for end, name in sorted(removed))
+    _restore_applications(state, intents)
     stored = sorted(intents("process").values(), key=lambda item: int(item["order"]))
     moves = intents("migration")
     for item in stored:
@@ -63,6 +65,18 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     images.restore(state, cluster)
 
 
+def _restore_applications(state: MasterState, intents: Callable[[str], _Table]) -> None:
+    for name, item in intents("application").items():
+        state.applications[name] = applications.application_from_dict(name, item)
+    for key, item in intents("version").items():
+        _, _, name = key.partition(" ")
+        if name in state.applications:
+            version = applications.version_from_dict(item)
+            state.applications[name].versions[version.number] = version
+    for one in state.applications.values():
+        one.versions = dict(sorted(one.versions.items()))
+
+
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
     phase = ProcessPhase(item["phase"])
     wall = float(item.get("since", state.wall))  # absent in older journals
@@ -74,6 +88,10 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
+    next_spec = item.get("next_spec")  # absent in older journals
+    process.next_spec = None if next_spec is None else from_plain(ProcessSpec, next_spec)
+    if not item.get("amended", True):
+        state.unamended[process.name] = -inf
     process.set_start(process.began, state.wall, now)
     if not process.is_at_rest:
         process.exit_code, process.ended_on = None, ""

@@ -13,7 +13,7 @@ from rosrm.core.master.state.lazy import Plain
 from rosrm.model.codec import fields_from_plain, fields_to_plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
-from rosrm.model.values import InstanceId, InstanceStatus
+from rosrm.model.values import InstanceId, InstanceStatus, ProcessSpec
 from rosrm.wording import first_line
 
 
@@ -72,6 +72,8 @@ class Migration:
         handoff_reports: instance number to its reports on a handoff.
         taking_over: the destination was ordered to take over without its source.
         results: executor name to its result.
+        spec: spec of the destination, if it is another one than the source's, which it replaces at
+            the commit; None: both have one spec.
         source_devices: devices that the source holds; they stay reserved until the commit or the
             end of the undo, because the source may be started again.
         aim: purpose of the plan. Source and destination of a checkpoint or restore are on one host.
@@ -109,6 +111,7 @@ class Migration:
     results: dict[str, Mapping[str, Any]] = field(default_factory=dict)
     aim: Aim = Aim.MOVE
     source_devices: tuple[HeldDevice, ...] = ()
+    spec: ProcessSpec | None = None
     plain_plan: Plain = field(init=False)
 
     def __post_init__(self) -> None:
@@ -144,6 +147,8 @@ class Migration:
     def progress_text(self) -> str:
         """Return the reason shown for the process during the migration."""
         host = self.destination_host.name
+        if self.spec is not None:
+            return f"it is replaced on {host} by its new version"
         return {
             Aim.MOVE: f"to {host}",
             Aim.CHECKPOINT: f"it is being checkpointed on {host}",
@@ -154,6 +159,12 @@ class Migration:
     def commit(self) -> Commit:
         """Return the commit of the plan."""
         return next(step for step in self.plan.steps if isinstance(step, Commit))
+
+    def spec_of(self, instance: InstanceId, spec: ProcessSpec) -> ProcessSpec:
+        """Return the spec of one of its instances; `spec`: that of its process."""
+        if self.spec is None or instance != self.destination:
+            return spec
+        return self.spec
 
     def begin_undo(self) -> None:
         """Begin the undo of all steps up to the current one, newest first."""
@@ -185,7 +196,7 @@ def undo_steps(plan: Plan, turned_at: int) -> Sequence[Step]:
 JOURNALED: Final = (
     "strategy", "cause", "wall", "source_node", "destination_node", "index", "turned_at",
     "committed", "failure", "launched", "suspended", "results", "aim",
-    "source_devices",
+    "source_devices", "spec",
 )  # fmt: skip
 _END: Final = ("ordered", "completed", "gone")
 _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")

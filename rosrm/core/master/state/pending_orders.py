@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from rosrm.core.master.commands import OrderId
+from rosrm.model.values import InstanceId, RestartPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +64,17 @@ class Reload:
     host: str
 
 
+@dataclass(frozen=True, slots=True)
+class RestartPolicyChange:
+    """The order gives a new restart policy to an instance."""
+
+    instance: InstanceId
+    restart: RestartPolicy
+
+
 Purpose = (
     MigrationStep
+    | RestartPolicyChange
     | ImageRemoval
     | Replication
     | CapabilityQuery

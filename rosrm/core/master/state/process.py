@@ -184,6 +184,7 @@ class Process:
     """One submitted process.
 
     Attributes:
+        next_spec: spec with which it is started again once its instances have ended; None: `spec`.
         order: place in the queue; unchanged when the process returns to the queue.
         principal: owner, the user that submitted the process, "user:ada"; "": unknown.
         since: start of its phase by this master's clock; earlier than the master's own start if the
@@ -256,6 +257,7 @@ class Process:
     next_run: float = 0.0
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()
+    next_spec: ProcessSpec | None = None
     demand: tuple[int, Demand] | None = None
     plain: Plain = field(init=False)
     node: str = field(init=False)

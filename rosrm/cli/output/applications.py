@@ -1,0 +1,81 @@
+"""Tables and messages on applications."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+
+from rich.table import Table
+from rich.text import Text
+
+from rosrm.cli.output.plain import echo
+from rosrm.cli.output.tables import state, table
+from rosrm.model.applications import ApplicationRow, PlannedAction, VersionRow
+from rosrm.wording import counted, few, listed
+
+
+def actions(rows: Sequence[PlannedAction]) -> Table:
+    """Return the table of a plan."""
+    made = table("ACTION", "PROCESS", "HOST", "WHY")
+    for row in rows:
+        moves = row.before and row.host and row.before != row.host
+        host = f"{row.before} -> {row.host}" if moves else row.host or row.before
+        made.add_row(row.action.value, Text(row.process), Text(host), Text(_why(row)))
+    return made
+
+
+def _why(row: PlannedAction) -> str:
+    """Return the reason of an action: changed fields, the placement, why it will wait."""
+    changed = f"changed: {listed(row.fields)}" if row.fields else ""
+    waits = f"will wait: {row.waits}" if row.waits else ""
+    hosts = row.decision["hosts"] if row.decision is not None else ()
+    placed = next((one["reason"] for one in hosts if one["verdict"] == "chosen"), "")
+    return "; ".join(filter(None, (row.reason, changed, waits, placed)))
+
+
+def applications(rows: Sequence[ApplicationRow]) -> Table:
+    """Return the table of `rosrm apps`."""
+    made = table("NAME", "STATE", "VERSION", "RUNNING", "WHY", right=("VERSION", "RUNNING"))
+    for row in rows:
+        made.add_row(
+            Text(row.name), state(row.state), str(row.version or "-"),
+            f"{row.running}/{row.processes}", Text(row.reason or _pending(row)),
+        )  # fmt: skip
+    return made
+
+
+def versions(rows: Sequence[VersionRow]) -> Table:
+    """Return the table of `rosrm history`, the newest version first."""
+    made = table("VERSION", "REQUESTED", "BY", "PROCESSES", "NOTE", right=("VERSION", "PROCESSES"))
+    for row in reversed(rows):
+        when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row.wall_time))
+        given_up = f"given up: {row.given_up}" if row.given_up else ""
+        note = "; ".join(filter(None, ("desired" * row.wanted, row.note, given_up)))
+        made.add_row(str(row.number), when, Text(row.by), str(row.processes), Text(note))
+    return made
+
+
+def _pending(row: ApplicationRow) -> str:
+    """Return the processes that are not yet as desired, with the reasons."""
+    phrases = [f"{name}: {why}" if why else name for name, why in row.pending.items()]
+    return "; ".join(few(phrases))
+
+
+def show_progress(row: ApplicationRow) -> None:
+    """Print how many processes of an application are not yet as desired."""
+    left = counted(len(row.pending), "process", "processes")
+    version = f" version {row.version}" if row.version else ""
+    echo(f"{row.name}{version}: {left} to go: {_pending(row)}", err=True)
+
+
+def show_end(row: ApplicationRow) -> bool:
+    """Print the state of an application; return True if it is as requested."""
+    given_up = row.returned_from
+    why = row.reason or _pending(row)
+    if given_up is not None:
+        why = f"version {given_up.number} was given up: {given_up.given_up}"
+    version = f" at version {row.version}" if row.version else ""
+    text = f"{row.name} is {row.state}{version}" + (f": {why}" if why else "")
+    is_done = given_up is None and row.state in ("running", "cancelled")
+    echo(text if is_done else f"rosrm: {text}", err=not is_done)
+    return is_done

@@ -1,0 +1,24 @@
+"""Section `rollout` of a work file: the way in which changed processes are replaced."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from rosrm.extensions.units import PositiveCount, Seconds
+from rosrm.model.applications import OnFailure, RolloutPolicy
+
+_DEFAULT: Final = RolloutPolicy()
+
+
+@dataclass(frozen=True, slots=True)
+class RolloutInFile:
+    """Keys of the section; see `RolloutPolicy`."""
+
+    max_parallel: PositiveCount = _DEFAULT.max_parallel
+    healthy_for: Seconds = _DEFAULT.healthy_for
+    on_failure: OnFailure = _DEFAULT.on_failure
+
+    def policy(self) -> RolloutPolicy:
+        """Return the policy that the section describes."""
+        return RolloutPolicy(self.max_parallel, self.healthy_for, self.on_failure)

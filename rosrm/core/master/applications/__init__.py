@@ -1,0 +1,1 @@
+"""Applications: requests, differences to the desired state, replacement, plans."""

@@ -1,0 +1,104 @@
+"""Difference between the processes of an application and the desired ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from operator import attrgetter
+from typing import Final
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.model.applications import Action
+from rosrm.model.values import ProcessSpec
+
+#: Fields that only the master reads, and `restart`, whose change a slave can apply to a running
+#: instance. A change of any other field takes effect with the next start.
+IN_PLACE: Final = frozenset(
+    {
+        "restart", "needs", "required_labels", "preferred_labels", "avoided_labels", "priority",
+        "migration", "neighbours", "talks_to", "reschedule", "protect", "time_limit",
+    }
+)  # fmt: skip
+_in_place_of: Final = attrgetter(*sorted(IN_PLACE))
+_FIELDS: Final = tuple(one.name for one in fields(ProcessSpec) if one.compare)
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Difference between one process and the desired one.
+
+    Attributes:
+        action: action by which the process gets as desired.
+        fields: names of the changed fields of the spec.
+        reason: cause of the action, if it is not a changed field.
+    """
+
+    action: Action
+    fields: tuple[str, ...] = ()
+    reason: str = ""
+
+
+def differences(
+    state: MasterState, application: str, specs: Mapping[str, ProcessSpec], names: Iterable[str]
+) -> dict[str, Difference]:
+    """Return the difference of each process that is not as desired.
+
+    Args:
+        specs: the desired processes.
+        names: names of the processes that the application may have now.
+    """
+    found = {}
+    for name in dict.fromkeys((*names, *specs)):
+        difference = difference_of(state, application, name, specs.get(name))
+        if difference is not None:
+            found[name] = difference
+    return found
+
+
+def difference_of(
+    state: MasterState, application: str, name: str, spec: ProcessSpec | None
+) -> Difference | None:
+    """Return the difference of one process; None: it is as desired.
+
+    Args:
+        spec: the desired process; None: none is desired.
+    """
+    process = state.processes.get(name)
+    if process is not None and process.spec.application != application:
+        process = None  # an ended process of another one
+    if spec is None:
+        lives = process is not None and not process.phase.is_terminal
+        return Difference(Action.STOP) if lives else None
+    if process is None:
+        return Difference(Action.START)
+    if process.phase.is_terminal or process.wanted is DesiredState.CANCEL:
+        return _of_ended(process, spec)
+    current = process.next_spec or process.spec
+    changed = changed_fields(current, spec)
+    if not changed:
+        return None
+    in_place = IN_PLACE.issuperset(changed)
+    return Difference(Action.CHANGE if in_place else Action.REPLACE, changed)
+
+
+def _of_ended(process: Process, spec: ProcessSpec) -> Difference | None:
+    """Return why an ended process is started again; None: it is a job that has finished."""
+    changed = changed_fields(process.spec, spec)
+    if process.phase is ProcessPhase.FINISHED and not changed:
+        return None
+    return Difference(Action.START, changed, f"it is {process.phase.value} now")
+
+
+def changed_fields(spec: ProcessSpec, other: ProcessSpec) -> tuple[str, ...]:
+    """Return the names of the fields in which two specs differ."""
+    if spec is other or spec == other:
+        return ()
+    return tuple(name for name in _FIELDS if getattr(spec, name) != getattr(other, name))
+
+
+def with_changes_in_place(spec: ProcessSpec, desired: ProcessSpec) -> ProcessSpec:
+    """Return a spec with those fields of the desired one that need no new start."""
+    if _in_place_of(spec) == _in_place_of(desired):
+        return spec
+    return replace(spec, **{name: getattr(desired, name) for name in IN_PLACE})

@@ -1,0 +1,60 @@
+"""Listings of applications as rows."""
+
+from __future__ import annotations
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.applications import Application, Version
+from rosrm.core.master.state.process import ProcessPhase
+from rosrm.model.applications import ApplicationRow, ApplicationState, VersionRow
+from rosrm.wording import few
+
+#: Phases of a process that is as its application wants it.
+_WELL = (ProcessPhase.RUNNING, ProcessPhase.SCHEDULED, ProcessPhase.FINISHED)
+
+
+def application_rows(state: MasterState) -> list[ApplicationRow]:
+    """Return every application, in order of its first request."""
+    return [_row(state, one) for one in state.applications.values()]
+
+
+def _row(state: MasterState, application: Application) -> ApplicationRow:
+    unwell = {
+        name: why for name in application.specs if (why := _why_unwell(state, application, name))
+    }
+    pending = {name: task.fault or task.reason for name, task in application.tasks.items()}
+    condition = _condition(application, unwell)
+    first = [f"{name} {why}" for name, why in unwell.items()]
+    return ApplicationRow(
+        application.name, application.principal, condition, application.wanted,
+        len(application.specs), len(application.specs) - len(unwell), pending,
+        application.paused or ("" if condition != "degraded" else "; ".join(few(first))),
+        tuple(_version_row(application, one) for one in application.versions.values()),
+    )  # fmt: skip
+
+
+def _condition(application: Application, unwell: dict[str, str]) -> ApplicationState:
+    if application.paused:
+        return "paused"
+    if application.tasks:
+        return "returning" if application.returning else "applying"
+    if not application.wanted:
+        return "cancelled"
+    return "degraded" if unwell else "running"
+
+
+def _why_unwell(state: MasterState, application: Application, name: str) -> str:
+    """Return a predicate for a process that is not as desired; "" if it is."""
+    process = state.processes.get(name)
+    if process is None or process.spec.application != application.name:
+        return "does not exist any more"
+    if process.phase in _WELL:
+        return ""
+    reason = f": {process.reason}" if process.reason else ""
+    return f"is {process.phase.value}{reason}"
+
+
+def _version_row(application: Application, version: Version) -> VersionRow:
+    return VersionRow(
+        version.number, version.wall, version.by, len(version.specs), version.note,
+        version.given_up, version.number == application.wanted,
+    )  # fmt: skip

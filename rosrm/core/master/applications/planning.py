@@ -1,0 +1,211 @@
+"""Plans: the core runs on a copy of its state, whose hosts carry out every order at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from copy import deepcopy
+from typing import Any, Final
+
+from rosrm.core.master import lifecycle
+from rosrm.core.master.answers import order_answered
+from rosrm.core.master.applications import restart_policies, rollout
+from rosrm.core.master.applications.difference import changed_fields
+from rosrm.core.master.assignment.assign import place_waiting
+from rosrm.core.master.commands import Assign, Command, PublishStateConfig, SendOrder
+from rosrm.core.master.events import HandoffReported, OrderAnswered
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration import executor, handoff
+from rosrm.core.master.migration.preemption import preempt
+from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.process import WAITING, Process, ProcessPhase
+from rosrm.model.applications import Action, PlannedAction
+from rosrm.model.orders import FenceInstance, StartInstance, StopInstance
+from rosrm.model.plan import HandoffPhase, ReportPhase
+from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus
+
+#: Seconds between two rounds of a plan, beyond the time for which a new instance must run well.
+_ROUND: Final = 2.0
+#: Most rounds; each begins or ends a task, as long as one can be begun.
+_MOST_ROUNDS: Final = 10_000
+#: Reports of the destination and the source of a handoff after each phase.
+_REPORTS: Final = {
+    HandoffPhase.SHADOW: (ReportPhase.READY, ReportPhase.ATTACHED),
+    HandoffPhase.SWITCH: (ReportPhase.ACTIVE, ReportPhase.RELEASED),
+    HandoffPhase.ABORT: (ReportPhase.ABORTED, ReportPhase.RESUMED),
+}
+
+
+def plan(
+    state: MasterState, change: Callable[[MasterState], None], now: float
+) -> tuple[tuple[PlannedAction, ...], list[str]]:
+    """Return the actions that follow a change, in order; the state does not change.
+
+    Return also a sentence on each application that would return to its former version.
+
+    Args:
+        change: changes a copy of the state.
+    """
+    copy = copied(state)
+    change(copy)
+    _run(copy, now)
+    returns = []
+    for name, application in copy.applications.items():
+        newest = application.versions.get(application.newest)
+        known = state.applications.get(name)
+        is_new = known is None or known.newest < application.newest
+        if is_new and newest is not None and newest.given_up:
+            text = f"{name} would return to version {application.wanted}: {newest.given_up}"
+            returns.append(text)
+    return tuple(_actions(state, copy)), returns
+
+
+def copied(state: MasterState) -> MasterState:
+    """Return a copy of the state for a plan; immutable values and plugins are shared."""
+    shared: list[Any] = [
+        state.settings, state.declared, state.placement, state.strategies, state.plugins,
+        state.chain_of, EMPTY,
+    ]  # fmt: skip
+    for process in state.processes.values():
+        shared += (process.spec, process.plain, process.decision, process.history, process.demand)
+    for host in state.hosts.hosts:
+        shared.append(host.description)
+    for application in state.applications.values():
+        shared += application.versions.values()
+    memo: dict[int, Any] = {id(one): one for one in shared}
+    memo[id(state.rankings)], memo[id(state.demands)] = {}, {}
+    copy = deepcopy(state, memo)
+    copy.rankings_version = -1
+    return copy
+
+
+def _run(state: MasterState, now: float) -> None:
+    """Let all tasks proceed until nothing changes any more."""
+    lasts = [
+        version.rollout.healthy_for
+        for application in state.applications.values()
+        if (version := application.version) is not None
+    ]
+    step, before = _ROUND + max(lasts, default=0.0), None
+    for _ in range(_MOST_ROUNDS):
+        _settle(state, now)
+        rollout.review(state, now)
+        restart_policies.review(state, now)
+        preempt(state, now)
+        _settle(state, now)
+        after = _progress(state)
+        if after == before:
+            return
+        before, now = after, now + step
+
+
+def _progress(state: MasterState) -> Any:
+    tasks = [
+        (one.wanted, name, task.begun, task.run)
+        for one in state.applications.values()
+        for name, task in one.tasks.items()
+    ]
+    return tasks, len(state.instances), len(state.queue), len(state.migrations)
+
+
+def _settle(state: MasterState, now: float) -> None:
+    """Place processes and advance migrations, while hosts carry out every order at once."""
+    while True:
+        executor.advance_all(state, now)
+        place_waiting(state, now)
+        effects = [_carried_out(state, command, now) for command in state.take()]
+        if not any(effects):
+            return
+
+
+def _carried_out(state: MasterState, command: Command, now: float) -> bool:
+    """Report the effect of a command; return False for one without an effect on hosts."""
+    match command:
+        case Assign(host_id, assignment):
+            host = state.hosts.hosts[host_id - 1]
+            _report(state, host, assignment.instance, InstanceState.READY, now)
+            state.hosts.ask(host)
+        case SendOrder(order_id, host_id, order):
+            host = state.hosts.hosts[host_id - 1]
+            answer = OrderAnswered(order_id, accepted=True)
+            order_answered(state, answer, now)
+            if isinstance(order, StartInstance):
+                _report(state, host, order.instance, InstanceState.READY, now)
+            elif isinstance(order, StopInstance | FenceInstance):
+                _report(state, host, order.instance, InstanceState.EXITED, now)
+        case PublishStateConfig():
+            _hand_over(state, command, now)
+        case _:
+            return False
+    return True
+
+
+def _report(
+    state: MasterState, host: Host, instance: InstanceId, condition: InstanceState, now: float
+) -> None:
+    lifecycle.take_status(state, host, InstanceStatus(instance, condition), now)
+
+
+def _hand_over(state: MasterState, command: PublishStateConfig, now: float) -> None:
+    for phase, number in zip(
+        _REPORTS.get(command.phase, ()), (command.destination, command.source), strict=False
+    ):
+        report = HandoffReported(command.process, command.destination, number, phase)
+        handoff.handoff_reported(state, report, now)
+
+
+def _actions(before: MasterState, after: MasterState) -> Iterable[PlannedAction]:
+    """Yield the differences between two states, in order of submission."""
+    names = dict.fromkeys((*before.processes, *after.processes))
+    for name in names:
+        action = _action(before, before.processes.get(name), after, after.processes[name])
+        if action is not None:
+            yield action
+
+
+def _action(
+    before: MasterState, old: Process | None, after: MasterState, new: Process
+) -> PlannedAction | None:
+    was, becomes = _host_of(before, old), _host_of(after, new)
+    decision = new.decision if old is None or new.decision is not old.decision else None
+    waits = new.reason if new.phase in WAITING else _task_reason(after, new)
+    kind = _kind(old, new, was, becomes)
+    if kind is None and not waits:
+        return None
+    return PlannedAction(
+        new.name, kind or Action.REPLACE, new.spec.application, becomes, was,
+        fields=_changed(old, after, new), waits=waits,
+        decision=None if decision is None else dict(decision),
+    )  # fmt: skip
+
+
+def _changed(old: Process | None, after: MasterState, new: Process) -> tuple[str, ...]:
+    """Return the fields in which the desired process differs from the one before."""
+    if old is None or old.phase.is_terminal:
+        return ()
+    application = after.applications.get(new.spec.application)
+    specs = application.specs if application is not None else {}
+    return changed_fields(old.spec, specs.get(new.name, new.spec))
+
+
+def _task_reason(state: MasterState, process: Process) -> str:
+    application = state.applications.get(process.spec.application)
+    task = application.tasks.get(process.name) if application is not None else None
+    return task.fault or task.reason if task is not None else ""
+
+
+def _host_of(state: MasterState, process: Process | None) -> str:
+    owner = state.instances.get(process.owner) if process is not None else None
+    return owner.host.name if owner is not None else ""
+
+
+def _kind(old: Process | None, new: Process, was: str, becomes: str) -> Action | None:
+    """Return the action between two states of one process; None: nothing was done."""
+    if old is None or (old.phase.is_terminal and new.order != old.order):
+        return None if new.phase is ProcessPhase.CANCELLED else Action.START
+    if old.phase.is_terminal:
+        return None
+    if new.phase.is_terminal:
+        return Action.STOP
+    if new.owner != old.owner:
+        return Action.REPLACE if new.spec != old.spec else Action.MOVE
+    return Action.CHANGE if new.spec != old.spec else None

@@ -1,0 +1,245 @@
+"""Requests on applications: apply, revert and cancel, and their plans."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.applications import rollout
+from rosrm.core.master.applications.difference import Difference, differences
+from rosrm.core.master.applications.planning import plan
+from rosrm.core.master.commands import Reply
+from rosrm.core.master.contradictions import neighbour_fault
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.outcomes import RequestRefused
+from rosrm.core.master.process_defaults import with_defaults
+from rosrm.core.master.quotas import check_quota
+from rosrm.core.master.requests import count, submission_fault
+from rosrm.core.master.rights import check_rights
+from rosrm.core.master.state.applications import Application, Version
+from rosrm.model.applications import Action, PlannedAction, Target
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.requester import Requester
+from rosrm.model.values import ProcessSpec
+from rosrm.wording import listed, no_such
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A checked target.
+
+    Attributes:
+        version: desired version; None: the application is cancelled.
+        found: name of each process that is not as desired to the difference.
+    """
+
+    application: Application
+    version: Version | None
+    found: Mapping[str, Difference]
+
+
+def applications_requested(
+    state: MasterState, event: happened.ApplicationsRequested, now: float
+) -> None:
+    """Make the requested versions the desired ones, or reply with the plan of that."""
+    prepared = _prepared(state, event)
+    if event.plan_only:
+        actions, returns = plan(state, lambda copy: _execute(copy, event, prepared, now), now)
+        message = "; ".join((_summary(prepared), *returns))
+        state.emit(Reply(event.request, message=message, actions=actions))
+        return
+    _execute(state, event, prepared, now)
+    actions = tuple(_actions(prepared))
+    state.emit(Reply(event.request, message=_summary(prepared), actions=actions))
+
+
+def _execute(
+    state: MasterState, event: happened.ApplicationsRequested, prepared: Iterable[Prepared],
+    now: float,
+) -> None:  # fmt: skip
+    for one in prepared:
+        _want(state, one, event.by, now)
+
+
+# --- checks -----------------------------------------------------------------------------------
+
+
+def _prepared(state: MasterState, event: happened.ApplicationsRequested) -> list[Prepared]:
+    """Return the checked targets; refuse the request as a whole."""
+    _refuse_twice((one.application for one in event.targets), "application")
+    versions = [_version_of(state, one, event.by) for one in event.targets]
+    wanted = [spec for version in versions if version for spec in version.specs.values()]
+    _refuse_twice((spec.name for spec in wanted), "process")
+    prepared = []
+    for target, version in zip(event.targets, versions, strict=True):
+        specs: Mapping[str, ProcessSpec] = {} if version is None else version.specs
+        _check_names(state, target.application, specs, event.by)
+        own = state.names_of(target.application)
+        found = differences(state, target.application, specs, own)
+        application = state.applications.get(target.application)
+        known = application or Application(target.application, event.by.name)
+        prepared.append(Prepared(known, version, found))
+    _check_specs(state, prepared, event.by)
+    return prepared
+
+
+def _refuse_twice(names: Iterable[str], what: str) -> None:
+    twice = [name for name, number in Counter(names).items() if number > 1]
+    if twice:
+        raise RequestRefused(
+            f"the {what} {listed(twice)} is given twice; names are unique. Nothing was changed",
+            "name_taken",
+        )
+
+
+def _version_of(state: MasterState, target: Target, by: Requester) -> Version | None:
+    """Return the desired version of a target; None: the application is cancelled."""
+    application = state.applications.get(target.application)
+    if application is not None and not by.may_act_on(application.principal):
+        owner = application.principal or "an unknown owner"
+        raise RequestRefused(
+            f"the application {target.application} belongs to {owner}; ask the owner or an "
+            f"operator. Nothing was changed",
+            "denied",
+        )
+    if target.specs:
+        return _new_version(state, target, application, by)
+    if application is None:
+        known = no_such("application", [target.application], reversed(state.applications))
+        raise RequestRefused(known, "unknown")
+    return _earlier_version(application, target.version, by, state.wall) if target.version else None
+
+
+def _new_version(
+    state: MasterState, target: Target, application: Application | None, by: Requester
+) -> Version:
+    """Return the version of given specs: the desired one, if it is the same."""
+    defaults = state.settings.process_defaults
+    filled = [with_defaults(spec, defaults) for spec in target.specs]
+    _refuse_twice((spec.name for spec, _ in filled), "process")
+    strangers = [spec.name for spec, _ in filled if spec.application != target.application]
+    if strangers:
+        raise RequestRefused(
+            f"{listed(strangers)} of a request for the application {target.application} are not "
+            f"its processes. Nothing was changed"
+        )
+    specs = {spec.name: spec for spec, _ in filled}
+    current = application.version if application is not None else None
+    if current is not None and (current.specs, current.rollout) == (specs, target.rollout):
+        return current
+    defaulted = {spec.name: paths for spec, paths in filled if paths}
+    number = application.newest + 1 if application is not None else 1
+    return Version(number, specs, defaulted, target.rollout, state.wall, by.name)
+
+
+def _earlier_version(application: Application, number: int, by: Requester, wall: float) -> Version:
+    """Return a new version with the processes of an earlier one."""
+    version = application.versions.get(number)
+    if version is None:
+        kept = listed(str(one) for one in application.versions) or "none"
+        raise RequestRefused(
+            f"the application {application.name} has no version {number} (any more); kept: {kept}. "
+            f"See `rosrm history {application.name}`. Nothing was changed",
+            "unknown",
+        )
+    if version is application.version:
+        return version
+    return Version(
+        application.newest + 1, version.specs, version.defaulted, version.rollout, wall, by.name,
+        note=f"as version {number}",
+    )  # fmt: skip
+
+
+def _check_names(
+    state: MasterState, name: str, specs: Mapping[str, ProcessSpec], by: Requester
+) -> None:
+    """Refuse names that other applications, users or single processes have."""
+    live = [
+        process
+        for one in specs
+        if (process := state.processes.get(one)) is not None and not process.phase.is_terminal
+    ]
+    check_rights([state.processes[one] for one in specs if one in state.processes], by)
+    others = [one for one in live if one.spec.application != name]
+    if others:
+        of = others[0].spec.application
+        whose = f"of the application {of}" if of else "a single process"
+        first = others[0].name
+        remedy = f"`rosrm cancel {first}` ends it" if not of else "choose another name"
+        raise RequestRefused(
+            f"{name} cannot have {first}, which is {whose} already; {remedy}. Nothing was changed",
+            "name_taken",
+        )
+
+
+def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester) -> None:
+    """Refuse new or changed processes that a submission would not accept."""
+    changed = [
+        (one.version.specs[name], one.version.defaulted.get(name, ()))
+        for one in prepared
+        if one.version is not None
+        for name, difference in one.found.items()
+        if difference.action is not Action.STOP
+    ]
+    specs = [spec for spec, _ in changed]
+    started = [
+        one.version.specs[name]
+        for one in prepared
+        if one.version is not None
+        for name, difference in one.found.items()
+        if difference.action is Action.START
+    ]
+    fault = submission_fault(state, changed, len(started)) or neighbour_fault(state, specs)
+    if fault:
+        raise RequestRefused(f"{fault}. Nothing was changed")
+    check_quota(state, started, by)
+
+
+# --- changes ----------------------------------------------------------------------------------
+
+
+def _want(state: MasterState, one: Prepared, by: Requester, now: float) -> None:
+    """Make a version the desired one, unless all processes are as it wants them already."""
+    application, version = state.applications.get(one.application.name), one.version
+    if application is None:
+        application = state.applications[one.application.name] = Application(
+            one.application.name, by.name
+        )
+    number = 0 if version is None else version.number
+    unchanged = number == application.wanted and not one.found
+    if unchanged and not application.tasks:
+        return
+    if version is not None and version.number > application.newest:
+        application.newest = version.number
+        state.save_version(application, version)
+    what = f"version {number}" if number else "a cancellation"
+    state.record(
+        now, EventKind.APPLICATION_REQUESTED, f"{what} of {application.name} was requested", by=by,
+        facts={"application": application.name, "version": number},
+    )  # fmt: skip
+    rollout.want(state, application, number, now)
+
+
+def _actions(prepared: Iterable[Prepared]) -> Iterable[PlannedAction]:
+    for one in prepared:
+        for name, found in one.found.items():
+            yield PlannedAction(
+                name, found.action, one.application.name, fields=found.fields, reason=found.reason
+            )
+
+
+def _summary(prepared: Sequence[Prepared]) -> str:
+    return "; ".join(map(_summary_of, prepared))
+
+
+def _summary_of(one: Prepared) -> str:
+    """Return a phrase on the version and the number of each kind of action."""
+    name, version = one.application.name, one.version
+    if not one.found:
+        what = "is cancelled already" if version is None else f"is at version {version.number}"
+        return f"{name} {what}: nothing changes"
+    numbers = Counter(found.action for found in one.found.values())
+    parts = [f"{count(number)} to {action.value}" for action, number in numbers.items()]
+    return f"{name}{f' version {version.number}' if version else ''}: {listed(parts)}"

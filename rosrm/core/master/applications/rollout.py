@@ -1,0 +1,269 @@
+"""Work on an application until all its processes are as desired.
+
+The tasks of an application name the processes that are not as desired. Each review looks at the
+state of such a process, and takes the next step towards the desired spec:
+
+==========================  ==================================================================
+process                     step
+==========================  ==================================================================
+is not desired              cancel it; the task ends when the process has ended
+does not exist, has ended   add it to the queue; the task ends when the process runs well
+differs in place            change its spec; its slave gets a changed restart policy
+waits in the queue          replace its spec
+waits for its next run      replace its spec
+runs, and can be replaced   migrate it to an instance of the new spec
+runs, and cannot            stop it; its next start has the new spec
+is in transition            wait
+==========================  ==================================================================
+
+A step that fails leads back to the former version of the application, unless there is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import inf
+from typing import Final
+
+from rosrm.core.master.applications.difference import differences, with_changes_in_place
+from rosrm.core.master.applications.replacement import NeverFits, try_replace
+from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.requests import add_process, cancel_process
+from rosrm.core.master.schedules import await_first_run
+from rosrm.core.master.state.applications import Application, Task
+from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
+from rosrm.model.applications import Action
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.requester import Requester
+from rosrm.model.values import Kind, ProcessSpec
+from rosrm.wording import counted
+
+#: Phases of a process that runs in any way that its slave reports.
+_STARTED: Final = (
+    ProcessPhase.ASSIGNED, ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF,
+)  # fmt: skip
+
+
+def review(state: MasterState, now: float) -> None:
+    """Take the next steps of all applications that are not as desired."""
+    for application in list(state.applications.values()):
+        if application.tasks and not application.paused:
+            _review(state, application, now)
+
+
+def _review(state: MasterState, application: Application, now: float) -> None:
+    version = application.version
+    most = inf if version is None else version.rollout.max_parallel
+    replacing = sum(task.begun and task.replaces for task in application.tasks.values())
+    for name, task in list(application.tasks.items()):
+        spec, was_begun = application.specs.get(name), task.begun
+        if spec is None:
+            done = _stop(state, application, name, now)
+        else:
+            done = _advance(state, application, task, spec, now, may_replace=replacing < most)
+            replacing += task.replaces and task.begun and not was_begun
+        if done:
+            _end(state, application, name)
+        elif task.fault:
+            _handle_fault(state, application, name, task, now)
+            return  # the tasks may be others now
+    if not application.tasks:
+        _note_end(state, application, now)
+
+
+def _end(state: MasterState, application: Application, name: str) -> None:
+    del application.tasks[name]
+    state.save_application(application)
+
+
+# --- one process ------------------------------------------------------------------------------
+
+
+def _stop(state: MasterState, application: Application, name: str, now: float) -> bool:
+    """Cancel a process that is not desired any more; return True if it has ended."""
+    process = state.processes.get(name)
+    if process is None or process.spec.application != application.name:
+        return True
+    if not process.phase.is_terminal and process.wanted is not DesiredState.CANCEL:
+        cancel_process(state, process, now, Requester(application.principal))
+    return process.phase.is_terminal and state.is_gone(process)
+
+
+def _advance(
+    state: MasterState, application: Application, task: Task, spec: ProcessSpec, now: float,
+    *, may_replace: bool,
+) -> bool:  # fmt: skip
+    """Take the next step for one desired process; return True if the process is as desired."""
+    process = state.processes.get(spec.name)
+    if process is None or process.phase.is_terminal:
+        return _advance_ended(state, application, task, process, spec, now)
+    if process.wanted is DesiredState.CANCEL:
+        task.reason = "waits until its former instance has ended"
+        return False
+    _change_in_place(state, process, spec, now)
+    if spec in (process.spec, process.next_spec):
+        return process.next_spec is None and _runs_well(state, application, task, process, now)
+    if task.begun and process.name not in state.migrations:
+        task.fault = task.fault or "its new version did not start"
+    elif not task.begun and may_replace:
+        _replace(state, application, task, process, spec, now)
+    elif not task.begun:
+        task.reason = "waits until other processes are replaced"
+    return False
+
+
+def _advance_ended(
+    state: MasterState, application: Application, task: Task, process: Process | None,
+    spec: ProcessSpec, now: float,
+) -> bool:  # fmt: skip
+    """Start a process that does not run; if this was done before, judge its end."""
+    if process is not None and not state.is_gone(process):
+        task.reason = "waits until its former instance has ended"
+        return False
+    if process is not None and task.begun and process.spec == spec:
+        if process.phase is ProcessPhase.FAILED:
+            task.fault = f"it failed: {process.reason}"
+        return not task.fault  # finished, or cancelled by a user since
+    _begin(state, application, task)
+    version = application.version
+    defaulted = version.defaulted.get(spec.name, ()) if version is not None else ()
+    add_process(state, spec, defaulted, Requester(application.principal), now)
+    return False
+
+
+def _begin(state: MasterState, application: Application, task: Task) -> None:
+    task.begun = True
+    state.save_application(application)
+
+
+def _change_in_place(state: MasterState, process: Process, spec: ProcessSpec, now: float) -> None:
+    """Apply those changes of a spec that need no new start."""
+    before = process.spec
+    changed = with_changes_in_place(before, spec)
+    if changed is before:
+        return
+    state.set_spec(process, changed)
+    if changed.restart != before.restart and process.owner:
+        state.unamended[process.name] = -inf
+    if process.phase is ProcessPhase.SET_ASIDE:
+        reconsider_set_aside(state, now)
+
+
+def _replace(
+    state: MasterState, application: Application, task: Task, process: Process, spec: ProcessSpec,
+    now: float,
+) -> None:  # fmt: skip
+    """Begin to replace a process whose spec needs a new start."""
+    if process.phase in WAITING:
+        state.unqueue(process)
+        process.next_spec = spec
+        state.enqueue(process, now)
+    elif process.phase is ProcessPhase.SCHEDULED:
+        state.set_spec(process, spec)
+        if not await_first_run(state, process, now):
+            state.enqueue(process, now)
+    elif process.phase in _STARTED and process.wanted is DesiredState.RUN:
+        cause = f"version {application.wanted} of {application.name}"
+        refusal = try_replace(state, process, spec, cause, now)
+        if isinstance(refusal, NeverFits):
+            task.fault = refusal.reason
+        if refusal is not None:
+            task.reason = refusal.reason
+            return
+    else:
+        task.reason = process.reason or f"it is {process.phase.value}"
+        return
+    task.reason = ""
+    _begin(state, application, task)
+
+
+def _runs_well(
+    state: MasterState, application: Application, task: Task, process: Process, now: float
+) -> bool:
+    """Return True if a process with the desired spec has run well for long enough."""
+    if not task.begun:  # it was only changed in place
+        task.reason = "waits until its slave has the new restart policy"
+        return process.name not in state.unamended
+    task.reason = process.reason or f"it is {process.phase.value}"
+    run, is_running = (process.owner, process.restarts), process.phase is ProcessPhase.RUNNING
+    if process.phase is ProcessPhase.SET_ASIDE and task.replaces and application.former:
+        task.fault = f"it is set aside: {process.reason}"
+    elif process.phase is ProcessPhase.BACKOFF or (run[0] == task.run[0] and run != task.run):
+        task.fault = f"it does not run well: {process.reason or 'it was restarted'}"
+    elif process.phase is ProcessPhase.SCHEDULED:
+        return True
+    elif is_running and process.name not in state.migrations:
+        if task.run != run:
+            task.run, task.well_since = run, now
+        return _has_lasted(application, task, process, now)
+    return False
+
+
+def _has_lasted(application: Application, task: Task, process: Process, now: float) -> bool:
+    version = application.version
+    lasts = 0.0 if version is None or not application.former else version.rollout.healthy_for
+    task.reason = f"must run for {lasts:g} s without a restart"
+    return process.spec.kind is Kind.JOB or now - task.well_since >= lasts
+
+
+# --- faults and the end -----------------------------------------------------------------------
+
+
+def _handle_fault(
+    state: MasterState, application: Application, name: str, task: Task, now: float
+) -> None:
+    """Return to the former version, or pause; without one, end the task."""
+    version, why = application.version, f"{name}: {task.fault}"
+    if version is None or not application.former:
+        _end(state, application, name)
+        _note(state, application, now, EventKind.APPLICATION_FAILED, f"is degraded: {why}")
+    elif version.rollout.on_failure == "pause":
+        application.paused = why
+        _note(state, application, now, EventKind.APPLICATION_FAILED, f"is paused: {why}")
+    else:
+        message = f"returns from version {version.number} to {application.former}: {why}"
+        _note(state, application, now, EventKind.APPLICATION_RETURNS, message)
+        state.save_version(application, replace(version, given_up=why))
+        _set_wanted(state, application, application.former, now, former=0)
+
+
+def want(state: MasterState, application: Application, number: int, now: float) -> None:
+    """Make a version the desired one on request, and begin the work on it; 0: no version."""
+    # The version before may be one that was not reached yet.
+    former = application.former if application.tasks else application.wanted
+    _set_wanted(state, application, number, now, former=former if number else 0)
+
+
+def _set_wanted(
+    state: MasterState, application: Application, number: int, now: float, *, former: int
+) -> None:
+    application.returning = bool(application.former and not former and number)
+    application.wanted, application.former, application.paused = number, former, ""
+    names = state.names_of(application.name)
+    found = differences(state, application.name, application.specs, names)
+    application.tasks = {
+        name: Task(replaces=one.action is Action.REPLACE) for name, one in found.items()
+    }
+    state.save_application(application)
+    _review(state, application, now)
+
+
+def _note_end(state: MasterState, application: Application, now: float) -> None:
+    """Record that an application is as desired, or is cancelled."""
+    version = application.version
+    application.returning, application.former = False, 0
+    if version is None:
+        _note(state, application, now, EventKind.APPLICATION_CANCELLED, "is cancelled")
+        return
+    processes = counted(len(version.specs), "process", "processes")
+    message = f"is at version {version.number} with {processes}"
+    _note(state, application, now, EventKind.APPLICATION_APPLIED, message)
+
+
+def _note(
+    state: MasterState, application: Application, now: float, kind: EventKind, message: str
+) -> None:
+    facts = {"application": application.name, "version": application.wanted}
+    state.record(now, kind, f"{application.name} {message}", facts=facts)
+    state.save_application(application)

@@ -1,0 +1,402 @@
+"""Applications: versions as desired states, replaced process by process, and plans of that."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosrm.core.master.commands import Reply
+from rosrm.model.applications import Action
+from rosrm.model.orders import SetRestartPolicy, StartInstance
+from rosrm.model.requester import Requester
+from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
+from tests.unit.core.cluster import Cluster, Machine, job, movable, process
+from tests.unit.core.test_handoffs import stateful
+
+
+def actions(reply: Reply) -> dict[str, str]:
+    """Return the action on each process in a reply."""
+    assert reply.accepted, reply.message
+    return {one.process: one.action.value for one in reply.actions}
+
+
+def program(cluster: Cluster, name: str) -> tuple[str, ...]:
+    """Return the command of the only instance of a process that really runs."""
+    running = [
+        held.assignment.spec.command
+        for machine in cluster.machines.values()
+        for one, held in machine.programs.items()
+        if one.process == name
+    ]
+    (command,) = running
+    return command
+
+
+def new(spec: ProcessSpec, command: str = "new") -> ProcessSpec:
+    """Return another version of a process, which needs a new start."""
+    return replace(spec, command=(command,))
+
+
+def state_of(cluster: Cluster, name: str = "nav") -> tuple[int, list[str]]:
+    """Return the desired version of an application, and its open tasks."""
+    application = cluster.state.applications[name]
+    return application.wanted, list(application.tasks)
+
+
+# --- apply ------------------------------------------------------------------------------------
+
+
+def test_an_application_becomes_equal_to_its_file() -> None:
+    """Missing processes start, others stop, the unchanged ones keep their instance."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), process("q"))
+    cluster.wait(1.0)
+    kept = cluster["p"].owner
+    reply = cluster.apply("nav", process("p"), process("r"))
+    assert actions(reply) == {"q": "stop", "r": "start"}
+    cluster.wait(2.0)
+    assert [cluster.phase(name) for name in "pqr"] == ["running", "cancelled", "running"]
+    assert cluster["p"].owner == kept
+    assert state_of(cluster) == (2, [])
+
+
+def test_an_unchanged_application_gets_no_new_version() -> None:
+    """The second apply of the same processes changes nothing."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    reply = cluster.apply("nav", process("p"))
+    assert reply.message == "nav is at version 1: nothing changes"
+    assert state_of(cluster) == (1, [])
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"priority": 7}, {"required_labels": {}}, {"needs": {"memory": 5.0}}, {"protect": True}],
+)
+def test_a_change_of_what_only_the_master_reads_restarts_nothing(changed: dict[str, Any]) -> None:
+    """The instance stays, and the process has the new values."""
+    cluster = Cluster(Machine("a", labels={"arm": "left"}))
+    first = process("p", required_labels={"arm": "left"})
+    cluster.apply("nav", first)
+    owner = cluster["p"].owner
+    assert actions(cluster.apply("nav", replace(first, **changed))) == {"p": "change"}
+    cluster.wait(1.0)
+    assert cluster["p"].owner == owner
+    assert cluster["p"].spec == replace(first, application="nav", **changed)
+    assert state_of(cluster) == (2, [])
+
+
+def test_a_restart_policy_changes_in_place() -> None:
+    """The slave gets the new policy for the running instance, also after a restart of the master.
+
+    The order is lost with the master.
+    """
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    policy = RestartPolicy("always", delay=0.5)
+    cluster.cut("a")
+    cluster.apply("nav", process("p", restart=policy))
+    cluster.reconnect("a")
+    cluster.restart_master()
+    cluster.wait(3.0)
+    (program_of_p,) = cluster.machines["a"].programs.values()
+    assert program_of_p.restart == policy
+    assert cluster.orders(SetRestartPolicy)[-1].restart == policy
+    assert state_of(cluster) == (2, [])
+
+
+def test_a_process_in_the_queue_gets_its_new_spec() -> None:
+    """A waiting process is placed by its new needs, at its place in the queue."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p", 20_000))
+    assert cluster.phase("p") in ("queued", "set_aside")
+    cluster.apply("nav", process("p", 20))
+    cluster.wait(2.0)
+    assert (cluster.phase("p"), state_of(cluster)) == ("running", (2, []))
+
+
+def test_ended_processes_start_again_but_finished_jobs_do_not() -> None:
+    """An apply of the same file starts what has failed or was cancelled."""
+    cluster = Cluster("a")
+    parts = (job("done"), process("failed"), process("cancelled"))
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.finish("done")
+    cluster.finish("failed", code=3)
+    cluster.cancel("cancelled")
+    cluster.wait(1.0)
+    assert actions(cluster.apply("nav", *parts)) == {"failed": "start", "cancelled": "start"}
+    cluster.wait(1.0)
+    assert [cluster.phase(one.name) for one in parts] == ["finished", "running", "running"]
+
+
+# --- replacement ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [process("p"), movable("p"), movable("p", overlap=False), stateful("p")],
+    ids=["without a strategy", "relaunch", "relaunch without overlap", "handoff"],
+)
+def test_a_changed_program_is_replaced(spec: ProcessSpec) -> None:
+    """By every strategy the new program runs, on its host, and there is one instance."""
+    cluster = Cluster("a", "b")
+    cluster.apply("nav", spec)
+    before = cluster.where("p")
+    cluster.apply("nav", new(spec))
+    cluster.wait(8.0)
+    assert program(cluster, "p") == ("new",)
+    assert cluster.where("p") == before
+    assert state_of(cluster) == (2, [])
+    assert cluster["p"].migrations == 0
+
+
+def test_a_stateful_process_hands_over_its_state_to_the_new_program() -> None:
+    """The new instance starts as a shadow with the new spec, and takes over."""
+    cluster = Cluster("a")
+    cluster.apply("nav", stateful("p"))
+    cluster.apply("nav", new(stateful("p")))
+    cluster.wait(8.0)
+    starts = [one.assignment for one in cluster.orders(StartInstance)]
+    assert [(one.shadow, one.spec.command) for one in starts] == [(True, ("new",))]
+    assert cluster.active("p") == ["a"]
+
+
+def test_at_most_max_parallel_processes_are_replaced_at_once() -> None:
+    """The next one begins when the one before has run well for `healthy_for`."""
+    cluster = Cluster("a")
+    parts = [movable(name) for name in "pqr"]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.apply("nav", *map(new, parts), healthy_for=5.0)
+    cluster.wait(4.0)
+    assert [program(cluster, name) for name in "pqr"] == [("new",), ("run", "it"), ("run", "it")]
+    cluster.wait(20.0)
+    assert [program(cluster, name) for name in "pqr"] == [("new",)] * 3
+
+
+def test_a_stateful_process_waits_for_room_and_a_stateless_one_is_stopped_first() -> None:
+    """Where no host has room for both instances, no state is lost."""
+    big = 8_000
+    cluster = Cluster("a", "b")
+    parts = [stateful("p", memory=big), movable("q", memory=big)]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.apply("nav", *map(new, parts), max_parallel=2)
+    cluster.wait(10.0)
+    assert program(cluster, "q") == ("new",)
+    assert program(cluster, "p") == ("run", "it")
+    task = cluster.state.applications["nav"].tasks["p"]
+    assert "no host has room for the new version of p beside the old" in task.reason
+
+
+# --- failures ---------------------------------------------------------------------------------
+
+
+def test_a_version_that_fails_is_given_up() -> None:
+    """The processes replaced so far return to the former version; the record says why."""
+    cluster = Cluster("a")
+    parts = [movable("p"), movable("q")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.apply("nav", *map(new, parts), healthy_for=5.0)
+    cluster.wait(3.0)
+    assert program(cluster, "p") == ("new",)
+    cluster.finish("p", code=1)
+    cluster.wait(10.0)
+    assert [program(cluster, name) for name in "pq"] == [("run", "it")] * 2
+    assert state_of(cluster) == (1, [])
+    (returned,) = cluster.recorded("application_returns")
+    assert returned.startswith("nav returns from version 2 to 1: p: it failed")
+    assert cluster.state.applications["nav"].versions[2].given_up
+
+
+def test_an_instance_that_never_gets_ready_changes_nothing() -> None:
+    """The former instance of a process runs on, and the application returns to its version."""
+    cluster = Cluster("a")
+    cluster.apply("nav", movable("p"))
+    cluster.wait(2.0)
+    owner = cluster["p"].owner
+    cluster.machines["a"].refuses["p"] = "no such program"
+    cluster.apply("nav", new(movable("p")))
+    cluster.wait(5.0)
+    assert (cluster["p"].owner, state_of(cluster)) == (owner, (1, []))
+
+
+def test_a_replacement_can_pause_instead() -> None:
+    """With `on_failure: pause` no other process is replaced, and none returns."""
+    cluster = Cluster("a")
+    parts = [movable("p"), movable("q")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.apply("nav", *map(new, parts), healthy_for=5.0, on_failure="pause")
+    cluster.wait(3.0)
+    cluster.finish("p", code=1)
+    cluster.wait(10.0)
+    assert program(cluster, "q") == ("run", "it")
+    assert cluster.state.applications["nav"].paused.startswith("p: it failed")
+
+
+def test_a_first_version_has_nothing_to_return_to() -> None:
+    """A process that fails leaves the others running."""
+    cluster = Cluster("a")
+    cluster.machines["a"].refuses["p"] = "no such program"
+    cluster.apply("nav", process("p"), process("q"))
+    cluster.wait(5.0)
+    assert cluster.phase("q") == "running"
+    assert state_of(cluster)[0] == 1
+
+
+# --- versions ---------------------------------------------------------------------------------
+
+
+def test_an_earlier_version_can_be_applied_again() -> None:
+    """A revert makes a new version with the processes of the earlier one."""
+    cluster = Cluster("a")
+    for command in ("one", "two"):
+        cluster.apply("nav", new(movable("p"), command))
+        cluster.wait(8.0)
+    assert actions(cluster.apply("nav", version=1)) == {"p": "replace"}
+    cluster.wait(8.0)
+    assert (program(cluster, "p"), state_of(cluster)) == (("one",), (3, []))
+
+
+def test_old_versions_are_dropped() -> None:
+    """The newest `keep_versions` are kept, in the journal too; a dropped one is refused by name."""
+    cluster = Cluster("a", keep_versions=2)
+    for number in range(4):
+        cluster.apply("nav", process("p", priority=number))
+        cluster.wait(1.0)
+    assert list(cluster.state.applications["nav"].versions) == [3, 4]
+    assert sorted(cluster.intents["version"]) == ["3 nav", "4 nav"]
+    reply = cluster.apply("nav", version=1)
+    assert not reply.accepted
+    assert "has no version 1 (any more); kept: 3 and 4" in reply.message
+
+
+def test_a_cancelled_application_can_be_applied_again() -> None:
+    """A request without processes cancels all of them; the versions stay."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), process("q"))
+    assert actions(cluster.apply("nav")) == {"p": "stop", "q": "stop"}
+    cluster.wait(2.0)
+    assert [cluster.phase(name) for name in "pq"] == ["cancelled"] * 2
+    assert state_of(cluster) == (0, [])
+    cluster.apply("nav", version=1)
+    cluster.wait(2.0)
+    assert [cluster.phase(name) for name in "pq"] == ["running"] * 2
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+def test_a_name_of_another_application_is_refused_as_a_whole() -> None:
+    """Nothing of the application starts."""
+    cluster = Cluster("a").with_processes(process("single"))
+    cluster.apply("map", process("p"))
+    for taken, whose in (("p", "of the application map"), ("single", "a single process")):
+        reply = cluster.apply("nav", process("q"), process(taken))
+        assert (reply.accepted, reply.code) == (False, "name_taken")
+        assert f"nav cannot have {taken}, which is {whose} already" in reply.message
+    assert "nav" not in cluster.state.applications
+
+
+def test_a_process_of_an_application_is_not_submitted() -> None:
+    """The refusal names the command."""
+    cluster = Cluster("a")
+    reply = cluster.submit(replace(process("p"), application="nav"))
+    assert not reply.accepted
+    assert "use `rosrm apply FILE`" in reply.message
+
+
+def test_an_application_of_another_user_is_refused() -> None:
+    """Only its owner and operators change an application."""
+    from rosrm.core.master import events as happened
+    from rosrm.model.applications import Target
+
+    cluster = Cluster("a")
+    ada, bob = Requester("user:ada"), Requester("user:bob")
+    target = Target("nav", (replace(process("p"), application="nav"),))
+    assert cluster.ask(happened.ApplicationsRequested, (target,), False, ada).accepted
+    reply = cluster.ask(happened.ApplicationsRequested, (Target("nav"),), False, bob)
+    assert (reply.accepted, reply.code) == (False, "denied")
+
+
+# --- a master that is killed ------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("killed_after", range(0, 60, 3))
+def test_a_killed_master_goes_on_with_the_replacement(killed_after: int) -> None:
+    """At each moment of an apply: the new version is reached, and each process runs once."""
+    cluster = Cluster("a", "b")
+    parts = [stateful("p"), movable("q"), process("r"), process("gone")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.apply("nav", *map(new, parts[:3]), process("added"))
+    cluster.wait(killed_after * 0.1)
+    cluster.restart_master()
+    cluster.wait(25.0)
+    assert [program(cluster, name) for name in "pqr"] == [("new",)] * 3
+    assert (cluster.where("gone"), len(cluster.where("added"))) == ([], 1)
+    assert state_of(cluster) == (2, [])
+
+
+# --- plans ------------------------------------------------------------------------------------
+
+
+def test_a_plan_names_each_action_with_its_host_and_changes_nothing() -> None:
+    """The apply that follows does what the plan says."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}))
+    parts = [stateful("p"), movable("q"), process("gone"), process("same")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    before = dict(cluster.intents["process"])
+    wanted = (*map(new, parts[:2]), parts[3], process("added"), process("huge", 20_000))
+    planned = cluster.apply("nav", *wanted, plan=True)
+    assert actions(planned) == {
+        "p": "replace", "q": "replace", "gone": "stop", "added": "start", "huge": "start",
+    }  # fmt: skip
+    assert cluster.intents["process"] == before
+    assert list(cluster.state.applications["nav"].versions) == [1]
+    waits = {one.process: one.waits for one in planned.actions if one.waits}
+    assert list(waits) == ["huge"]
+    cluster.apply("nav", *wanted)
+    cluster.wait(20.0)
+    hosts = {one.process: one.host for one in planned.actions if one.host}
+    assert {name: cluster.where(name) for name in hosts} == {
+        name: [host] for name, host in hosts.items()
+    }
+
+
+def test_a_plan_shows_a_return_to_the_former_version() -> None:
+    """Where the new version of a process can never run, the old one is not stopped for it."""
+    cluster = Cluster("a")
+    cluster.apply("nav", movable("p"))
+    cluster.wait(2.0)
+    owner, never = cluster["p"].owner, new(movable("p", needs={"gpu": 1.0}))
+    cluster.apply("nav", never)
+    cluster.wait(2.0)
+    assert (cluster["p"].owner, state_of(cluster)) == (owner, (1, []))
+    planned = cluster.apply("nav", replace(never, arguments=("again",)), plan=True)
+    assert "nav would return to version 1: p: no host may take its new version" in planned.message
+
+
+def test_a_plan_shows_what_waits_for_room() -> None:
+    """A stateful process without room for its successor is not replaced in the plan either."""
+    cluster = Cluster("a")
+    cluster.apply("nav", stateful("p", memory=8_000))
+    planned = cluster.apply("nav", new(stateful("p", memory=8_000)), plan=True)
+    (action,) = planned.actions
+    assert (action.action, action.host) == (Action.REPLACE, "a")
+    assert "no host has room" in action.waits
+
+
+def test_a_plan_moves_with_a_change_of_its_strategy() -> None:
+    """A change of the strategy alone is made in place."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    planned = cluster.apply("nav", process("p", migration=MigrationPolicy("relaunch")), plan=True)
+    assert actions(planned) == {"p": "change"}
