@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
+from rosrm.config.start_order_forms import StartOrderInFile
 from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
@@ -35,6 +36,7 @@ from rosrm.model.values import (
     RestartCondition,
     RestartPolicy,
     StandbyPolicy,
+    StartOrder,
     StopPolicy,
 )
 from rosrm.wording import listed
@@ -216,6 +218,7 @@ class ProcessInFile:
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
     devices: AskedByKind = field(default_factory=lambda: EMPTY)
+    after: Annotated[StartOrder, StartOrderInFile()] = field(default_factory=StartOrder)
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -245,6 +248,7 @@ class ProcessInFile:
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
+            start_order=self.after,
             given=(),
         )
 
@@ -344,6 +348,19 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
                 fault = f"{name} names itself; only other processes are allowed"
             if fault:
                 yield Complaint((key,), f"{key}: {fault}")
+
+
+def _about_start_order(spec: ProcessSpec) -> Iterator[Complaint]:
+    order = spec.start_order
+    for name in order.after:
+        fault = name_fault(name, "process")
+        if name == spec.name:
+            fault = f"{name} names itself; only other processes are allowed"
+        if fault:
+            yield Complaint(("after", name), f"after: {fault}")
+    if order != StartOrder() and not order.after:
+        text = "after: the name of at least one process is required"
+        yield Complaint(("after",), text)
 
 
 def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -471,6 +488,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_start_order, ("name", "after")),
     (_about_devices, ("devices", "arguments", "parameters")),
     (_about_flows, ("name", "talks_to")),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),

@@ -59,6 +59,14 @@ class EventKind(str, Enum):
     CANCELLED = "cancelled", "the process ended because it was cancelled"
     OVERDUE = "overdue", "the time limit of the job has passed: it is stopped, and has failed"
     RESTART_REQUESTED = "restart_requested", "a client restarts the process"
+    DEPENDENCY_RESTARTED = (
+        "dependency_restarted",
+        "the process is restarted, because a process after which it starts was restarted",
+    )
+    DEPENDANTS_LEFT = (
+        "dependants_left",
+        "the process is stopped before those that start after it, which did not end in time",
+    )
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
     FENCED = "fenced", "a host runs an instance that has a successor: it is killed"

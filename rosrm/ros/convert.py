@@ -95,6 +95,7 @@ _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     tuple[str, ...]: (list, tuple),
     tuple[int, ...]: (list, lambda numbers: tuple(map(int, numbers))),
     Mapping[str, str]: (pairs, mapping),
+    Mapping[str, values.StartCondition]: (pairs, mapping),
     values.Kind: (attrgetter("value"), values.Kind),
     values.InstanceState: (attrgetter("value"), values.InstanceState),
 }
@@ -214,6 +215,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _neighbours_fault(message)
         or _devices_fault(message)
         or _flows_fault(message)
+        or _start_order_fault(message)
     )
 
 
@@ -279,12 +281,29 @@ def _flows_fault(message: msg.ProcessSpec) -> str:
     return ""
 
 
+def _start_order_fault(message: msg.ProcessSpec) -> str:
+    allowed = get_args(values.StartCondition)
+    for pair in message.start_order.after:
+        fault = name_fault(pair.key, "process")
+        if not fault and pair.key == message.name:
+            fault = f"{message.name} names itself; only other processes are allowed"
+        if not fault and pair.value not in allowed:
+            fault = f"{pair.key} {pair.value!r:.100}; allowed: {', '.join(allowed)}"
+        if fault:
+            return f"after: {fault}"
+    return ""
+
+
 def _word_fault(message: msg.ProcessSpec) -> str:
     words = (
         ("kind", message.kind, tuple(kind.value for kind in values.Kind)),
         ("readiness", message.readiness.kind, get_args(values.ReadinessKind)),
         ("host_loss", message.host_loss.then, get_args(values.HostLossAction)),
         ("isolation", message.isolation.then, get_args(values.IsolationAction)),
+        (
+            "after.on_restart", message.start_order.on_restart,
+            get_args(values.DependencyRestartAction),
+        ),
     )
     for name, given, allowed in words:
         if given not in allowed:
@@ -306,6 +325,7 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "health.timeout": message.health.timeout,
         "reschedule.delay": message.reschedule.delay,
         "time_limit": message.time_limit,
+        "after.delay": message.start_order.delay,
     }
     for name, seconds in times.items():
         if not 0.0 <= seconds <= LONGEST:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from rosrm.core.master import events as happened
-from rosrm.core.master import reloading
+from rosrm.core.master import reloading, start_order
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import steps
 from rosrm.core.master.state.pending_orders import (
     CapabilityQuery,
+    DependencyRestart,
     ImageRemoval,
     LinkMeasurement,
     MigrationStep,
@@ -37,5 +38,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             links.note_answer(state, host, event, now)
         case Reload(host):
             reloading.note_answer(state, host, event, now)
+        case DependencyRestart():
+            start_order.note_answer(state, purpose, event)
         case ImageRemoval(number):
             images.note_answer(state, number, event, now)

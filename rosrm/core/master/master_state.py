@@ -32,6 +32,7 @@ from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, P
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
+from rosrm.core.master.state.start_orders import StartOrders
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import ChainOf, PlacementPlugins
@@ -126,6 +127,7 @@ class MasterState:
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
+        self.start_orders = StartOrders()
         self.flows = Flows()
         self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
@@ -274,6 +276,7 @@ class MasterState:
         """Move a process to another phase."""
         if process.phase is not phase:
             self._begin_phase(process, phase, now)
+            self.start_orders.note_change(process.name)
         process.reason = reason
         self._update_terminal(process)
 
@@ -297,6 +300,7 @@ class MasterState:
         self.processes.pop(process.name, None)  # listings are in order of submission
         self.processes[process.name] = process
         self._update_terminal(process)
+        self.start_orders.note_change(process.name)
 
     def _update_terminal(self, process: Process) -> None:
         """Update `terminal`, which stays in the order in which processes ended."""
@@ -308,16 +312,19 @@ class MasterState:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
+            if process.spec.start_order.after:
+                self.start_orders.add(process.spec)
             self.flows.declare(process.name, process.spec.talks_to)
         else:
             self.terminal.setdefault(process.name)
             self.wants_standby.pop(process.name, None)
             self.time_limited.pop(process.name, None)
             self.neighbours.remove(process.name)
+            self.start_orders.remove(process.name)
             self.flows.remove(process.name)
 
     def collect_garbage(self) -> None:
-        """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
+        """Remove terminal processes beyond the newest `keep_ended` that may be removed."""
         excess = len(self.terminal) - self.settings.keep_ended
         if excess <= 0:
             return
@@ -326,8 +333,12 @@ class MasterState:
             self.remove_process(name)
 
     def is_gone(self, process: Process) -> bool:
-        """Return True if neither an instance nor a standby of a terminal process may run."""
-        return not process.instances and process.name not in self.standbys
+        """Return True if a terminal process may be removed.
+
+        Neither an instance nor a standby of it may run, and no live process starts after it.
+        """
+        may_run = process.instances or process.name in self.standbys
+        return not may_run and process.name not in self.start_orders.dependants
 
     def remove_process(self, name: str) -> None:
         """Remove a terminal process from memory and journal; none of its instances may run."""
@@ -354,6 +365,7 @@ class MasterState:
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue = DesiredState.RUN, False
         process.started_at, process.began = inf, 0.0
+        process.restart_due = False
         self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.put_in_queue(process)
@@ -361,6 +373,7 @@ class MasterState:
     def put_in_queue(self, process: Process) -> None:
         """Add a process whose phase is QUEUED to the queue."""
         self.queue.add(process.name, process.spec.priority, process.order)
+        self.start_orders.note_change(process.name)
         if process.queue_delay:
             self.queue.delayed.add(process.name)
 

@@ -78,7 +78,7 @@ def _leaves(
 def _applies(path: str, default: Any, spec: ProcessSpec) -> bool:
     """Return True if a field may have a default, and the process is of the right kind for it."""
     first = path.partition(".")[0]
-    if first in IDENTITY or first in ("name", "given", "neighbours"):
+    if first in IDENTITY or first in ("name", "given", "neighbours", "start_order"):
         return False
     if path == "migration.options" and not _is_left_out(
         "migration.strategy", spec.migration.strategy, None, spec

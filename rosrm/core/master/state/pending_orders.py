@@ -63,6 +63,14 @@ class Reload:
     host: str
 
 
+@dataclass(frozen=True, slots=True)
+class DependencyRestart:
+    """The order restarts the instance of a process, because a dependency was restarted."""
+
+    process: str
+    number: int
+
+
 Purpose = (
     MigrationStep
     | ImageRemoval
@@ -71,6 +79,7 @@ Purpose = (
     | PeriodicCheckpoint
     | LinkMeasurement
     | Reload
+    | DependencyRestart
 )
 
 #: Purposes with their own series of numbers, because they depend on optional plugins or are

@@ -174,7 +174,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on",
+    "failed_on", "restart_due",
 )  # fmt: skip
 
 
@@ -214,6 +214,8 @@ class Process:
         overdue: True: its time limit has passed, and it is being stopped.
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
+        restart_due: True: a dependency was restarted, and the process must be restarted in place as
+            soon as the conditions of its start order hold.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
@@ -251,6 +253,7 @@ class Process:
     overdue: bool = False
     reschedules: int = 0
     queue_delay: float = 0.0
+    restart_due: bool = False
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()
     demand: tuple[int, Demand] | None = None
