@@ -301,7 +301,8 @@ def _word_fault(message: msg.ProcessSpec) -> str:
         ("host_loss", message.host_loss.then, get_args(values.HostLossAction)),
         ("isolation", message.isolation.then, get_args(values.IsolationAction)),
         (
-            "after.on_restart", message.start_order.on_restart,
+            "after.on_restart",
+            message.start_order.on_restart,
             get_args(values.DependencyRestartAction),
         ),
     )

@@ -16,7 +16,10 @@ from rosrm.wording import listed
 
 def note_restart(state: MasterState, process: Process) -> None:
     """Let the dependants that follow a restart restart too, once their conditions hold again."""
-    for name in state.start_orders.dependants.get(process.name, ()):
+    names = state.start_orders.dependants.get(process.name, ())
+    if names:
+        state.save(process)  # a later master must not take this restart for a new one
+    for name in names:
         dependant = state.processes[name]
         if dependant.owner and dependant.spec.start_order.on_restart == "restart":
             dependant.restart_due = True
@@ -28,7 +31,7 @@ def dependants_first(state: MasterState, processes: Sequence[Process]) -> list[P
     """Return processes in the order of their stops."""
     named = {process.name: process for process in processes}
     dependants = state.start_orders.dependants
-    before = {name: dependants.get(name, {}).keys() & named.keys() for name in named}
+    before = {name: [one for one in dependants.get(name, ()) if one in named] for name in named}
     if not any(before.values()):
         return list(processes)
     return [named[name] for name in TopologicalSorter(before).static_order()]

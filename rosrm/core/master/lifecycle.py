@@ -152,12 +152,7 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
     if status.state in _ALIVE and not process.began:
         process.started_at, process.began = now, state.wall
         state.save(process)
-    if _is_another_run(process, status, before, pid):
-        dependants.note_restart(state, process)
-    if process.restarts != status.restarts:
-        process.phase_before_loss = None  # restarted while its host was silent
-        note_run(process, status)  # of the run before the restart
-    process.restarts = status.restarts
+    _note_restarts(state, process, status, before, pid)
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_owner(state, process, instance, now)
         if not instance.stopping:
@@ -166,6 +161,19 @@ def _take_status(state: MasterState, host: Host, status: InstanceStatus, now: fl
         stop_instance(state, instance, now)  # the standby is ready sooner, and has the snapshot
     if process.name not in state.migrations:
         _follow(state, process, instance, status, now, repeated=before is status.state)
+
+
+def _note_restarts(
+    state: MasterState, process: Process, status: InstanceStatus, before: InstanceState | None,
+    pid: int,
+) -> None:  # fmt: skip
+    """Note the restarts of a process; the arguments are those of `_is_another_run`."""
+    if _is_another_run(process, status, before, pid):
+        dependants.note_restart(state, process)
+    if process.restarts != status.restarts:
+        process.phase_before_loss = None  # restarted while its host was silent
+        note_run(process, status)  # of the run before the restart
+    process.restarts = status.restarts
 
 
 def _is_another_run(

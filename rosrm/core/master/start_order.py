@@ -64,12 +64,12 @@ def review(state: MasterState, now: float) -> None:
 
 def _review_waiting(state: MasterState, process: Process, now: float) -> None:
     """Let a queued process wait for its dependencies, or be placed."""
-    reason = _awaited(state, process, now)
-    state.queue.set_awaiting(process.name, awaiting=bool(reason))
+    reason, name = _awaited(state, process, now), process.name
     if reason and process.reason != reason:
+        state.record(now, EventKind.WAITS, f"{name} {reason}", process=name)
+    if reason or name in state.queue.awaiting:
         process.reason = reason
-        message = f"{process.name} {reason}"
-        state.record(now, EventKind.WAITS, message, process=process.name)
+    state.queue.set_awaiting(name, awaiting=bool(reason))
 
 
 def _awaited(state: MasterState, process: Process, now: float) -> str:
@@ -221,7 +221,7 @@ def _dependency_fault(
     if spec is None:
         return no_such("process", [name], [*starting, *reversed(state.processes)])
     if condition == "finished" and spec.kind is not Kind.JOB:
-        return f"{name} is a service, which does not finish; use `ready`, or make it a `kind: job`"
+        return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
     if name in starting or process is None or _holds_since(state, name, condition) < inf:
         return ""
     ends = process.wanted is DesiredState.CANCEL or process.phase.is_terminal

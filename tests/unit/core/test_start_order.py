@@ -250,7 +250,7 @@ REFUSED = {
     ),
     "a circle": (
         [dependant("x", "y"), dependant("y", "z"), dependant("z", "x")],
-        "after: z -> x -> y -> z is a circle, in which each process starts after the next",
+        "after: x -> y -> z -> x is a circle, in which each process starts after the next",
     ),
     "a failed one": (
         [dependant("b", "broken")],
@@ -262,8 +262,7 @@ REFUSED = {
     ),
     "the end of a service": (
         [process("b", start_order=after(camera="finished"))],
-        "b: after: camera is a service, which does not finish; use `ready`, or make it a "
-        "`kind: job`",
+        "b: after: camera is a service, which does not finish; use `ready` or declare it as a job",
     ),
     "a service that has ended": (
         [dependant("b", "ended")],

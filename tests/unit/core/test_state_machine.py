@@ -19,6 +19,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import demand_of
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.core.slave import events
@@ -35,6 +36,7 @@ from rosrm.model.values import (
     RestartPolicy,
     SnapshotReport,
     StandbyPolicy,
+    StartOrder,
 )
 from tests.unit.core import invariants
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
@@ -54,6 +56,8 @@ ways = st.sampled_from(
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
+#: Start orders that a process may have, to be completed with a dependency.
+starts = st.sampled_from(["", "", "", "ready", "finished", "ready, later", "ready, restart"])
 asked = st.sampled_from(["", "", "camera", "gpu", "half gpu", "half gpu"])
 NEEDS = {
     "": (),
@@ -86,7 +90,7 @@ def is_open(hosts: HostTable, column: int) -> bool:
 
 def spec(
     name: str, kind: str, memory: int, moves: str, special: bool, priority: int,
-    loss: str = "wait", devices: str = "",
+    loss: str = "wait", devices: str = "", start_order: StartOrder | None = None,
 ) -> ProcessSpec:  # fmt: skip
     """Draw one of a few sorts of process."""
     word = moves.partition(",")[0]
@@ -103,8 +107,23 @@ def spec(
         standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
         time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
-        devices=NEEDS[devices],
+        devices=NEEDS[devices], start_order=start_order or StartOrder(),
     )  # fmt: skip
+
+
+def after(name: str, start: str) -> StartOrder:
+    """Return a start order after one process."""
+    condition, _, more = start.partition(", ")
+    on_restart = "restart" if more == "restart" else "ignore"
+    return StartOrder({name: condition}, 1.0 if more == "later" else 0.0, on_restart)
+
+
+def holds(state: MasterState, name: str, condition: str) -> bool:
+    """Return True if a process meets the condition of a start order."""
+    process = state.processes[name]
+    if process.phase is ProcessPhase.FINISHED:
+        return condition == "finished" or process.spec.kind is Kind.JOB
+    return process.phase is ProcessPhase.RUNNING and condition == "ready"
 
 
 class OneOther:
@@ -191,8 +210,16 @@ class Play(RuleBasedStateMachine):
             assert not (over > 1e-6).any(), "assigned over a limit"
             assert is_open(state.hosts, column), "assigned to a host that is closed"
             assert state.hosts.processes[column] <= state.hosts.bound[column]
+            self.look_at_dependencies(assign)
         self.look_at_order(given)
         self.look_at_states(given)
+
+    def look_at_dependencies(self, assign: Assign) -> None:
+        """Check that no process starts before its dependencies hold."""
+        state, order = self.cluster.state, assign.assignment.spec.start_order
+        for name, condition in order.after.items():
+            assert holds(state, name, condition), (name, condition)
+            assert self.cluster.now >= state.processes[name].since + order.delay
 
     def look_at_states(self, given: list[Assign]) -> None:
         """Check that no process starts from nothing if a connected host reported its snapshot."""
@@ -217,6 +244,8 @@ class Play(RuleBasedStateMachine):
             for name in state.queue:
                 waits = state.processes[name]
                 if awaits_states(state, waits, self.cluster.now) or name in state.queue.delayed:
+                    continue
+                if name in state.queue.awaiting:
                     continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
                 alike = demand_of(state, waits).key == demand_of(state, chosen).key
@@ -276,16 +305,19 @@ class Play(RuleBasedStateMachine):
         name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
         memory=st.sampled_from([0, 100, 100, 300]),
         moves=ways | st.just(""),
-        special=chance, urgent=chance, twin=names, loss=losses, devices=asked,
+        special=chance, urgent=chance, twin=names, loss=losses, devices=asked, start=starts,
+        first=names,
     )  # fmt: skip
     def submit(
         self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool,
-        twin: str, loss: str = "wait", devices: str = "",
+        twin: str, loss: str = "wait", devices: str = "", start: str = "", first: str = "",
     ) -> None:  # fmt: skip
+        """Submit two processes; with `start`, the second one starts after the first or another."""
         special = special and memory == 300
+        order = after(first, start) if start else None
         specs = [
-            spec(one, kind, memory, moves, special, int(urgent), loss, devices)
-            for one in (name, twin)
+            spec(name, kind, memory, moves, special, int(urgent), loss, devices),
+            spec(twin, kind, memory, moves, special, int(urgent), loss, devices, order),
         ]
         before = set(self.cluster.state.processes)
         if self.ask(happened.SubmissionReceived, tuple(specs)):
@@ -299,6 +331,12 @@ class Play(RuleBasedStateMachine):
     @rule(name=names)
     def cancel(self, name: str) -> None:
         self.ask(happened.CancelRequested, (name,))
+        self.flow()
+
+    @rule()
+    def cancel_all(self) -> None:
+        """Cancel all at once, in the reverse order of their starts."""
+        self.ask(happened.CancelRequested, tuple(self.cluster.state.processes))
         self.flow()
 
     @rule(name=names)
@@ -846,6 +884,23 @@ class Play(RuleBasedStateMachine):
             self.newest[name] = (born, newest)
 
     @invariant()
+    def what_waits_for_others_can_be_found(self) -> None:
+        """Check the index of start orders against the specs."""
+        state = self.cluster.state
+        orders = {
+            process.name: process.spec.start_order
+            for process in state.processes.values()
+            if process.spec.start_order.after and not process.phase.is_terminal
+        }
+        assert state.start_orders.declared == orders
+        assert {
+            (name, one) for name, found in state.start_orders.dependants.items() for one in found
+        } == {(name, one) for one, order in orders.items() for name in order.after}
+        assert state.queue.awaiting <= orders.keys()
+        for name in state.start_orders.last_to_stop:
+            assert state.processes[name].wanted is DesiredState.CANCEL
+
+    @invariant()
     def an_end_is_told_as_it_was(self) -> None:
         """Check that each finished or failed process really ended so."""
         for process in self.cluster.state.processes.values():
@@ -889,6 +944,9 @@ class Play(RuleBasedStateMachine):
                 where.remove(cluster.state.standbys[process.name].destination_host.name)
             assert len(where) == (process.phase is ProcessPhase.RUNNING), (process.name, where)
             assert cluster.active(process.name) == where
+            if process.phase is ProcessPhase.RUNNING and process.restart_due:
+                conditions = process.spec.start_order.after.items()
+                assert not all(holds(cluster.state, *one) for one in conditions), process.name
         self._cancel_all()
 
     def _let_nodes_come_up(self, times: int) -> None:

@@ -57,7 +57,8 @@ class StartOrders:
         """Review a process and its dependants, because its phase has changed."""
         if name in self.declared:
             self.to_review[name] = None
-        self.to_review.update(self.dependants.get(name, {}))
+        if name in self.dependants:
+            self.to_review.update(self.dependants[name])
 
     def note_dependant(self, order: StartOrder) -> None:
         """Review the dependencies of a process that has ended or was ordered to stop."""
