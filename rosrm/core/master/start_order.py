@@ -217,9 +217,9 @@ def _dependency_fault(
 ) -> str:
     """Return why no process can start after this one; "": it can."""
     process = state.processes.get(name)
-    spec = starting.get(name) or (process and process.spec)
-    if spec is None:
+    if process is None and name not in starting:
         return no_such("process", [name], [*starting, *reversed(state.processes)])
+    spec = starting[name] if process is None or name in starting else process.spec
     if condition == "finished" and spec.kind is not Kind.JOB:
         return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
     if name in starting or process is None or _holds_since(state, name, condition) < inf:
@@ -232,11 +232,10 @@ def _reachable(
     state: MasterState, specs: Mapping[str, ProcessSpec]
 ) -> Iterator[tuple[str, Sequence[str]]]:
     """Yield each of the processes, and those after which they start, with its dependencies."""
-    open_names, seen = list(reversed(specs)), set[str]()
-    while open_names:
-        name = open_names.pop()
+    names, seen = list(specs), set[str]()
+    for name in names:  # they become more
         order = specs[name].start_order if name in specs else state.start_orders.declared.get(name)
         if name not in seen and order is not None:
             seen.add(name)
             yield name, list(order.after)
-            open_names += order.after
+            names += order.after

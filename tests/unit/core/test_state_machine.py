@@ -56,8 +56,9 @@ ways = st.sampled_from(
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
+kinds = st.sampled_from(["service", "job", "node", "node"])
 #: Start orders that a process may have, to be completed with a dependency.
-starts = st.sampled_from(["", "", "", "ready", "finished", "ready, later", "ready, restart"])
+starts = st.sampled_from(["ready", "finished", "ready, later", "ready, restart"])
 asked = st.sampled_from(["", "", "camera", "gpu", "half gpu", "half gpu"])
 NEEDS = {
     "": (),
@@ -302,28 +303,41 @@ class Play(RuleBasedStateMachine):
     # --- users ---------------------------------------------------------------------------
 
     @rule(
-        name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
+        name=names, kind=kinds,
         memory=st.sampled_from([0, 100, 100, 300]),
         moves=ways | st.just(""),
-        special=chance, urgent=chance, twin=names, loss=losses, devices=asked, start=starts,
-        first=names,
+        special=chance, urgent=chance, twin=names, loss=losses, devices=asked,
     )  # fmt: skip
     def submit(
         self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool,
-        twin: str, loss: str = "wait", devices: str = "", start: str = "", first: str = "",
+        twin: str, loss: str = "wait", devices: str = "",
     ) -> None:  # fmt: skip
-        """Submit two processes; with `start`, the second one starts after the first or another."""
         special = special and memory == 300
-        order = after(first, start) if start else None
         specs = [
-            spec(name, kind, memory, moves, special, int(urgent), loss, devices),
-            spec(twin, kind, memory, moves, special, int(urgent), loss, devices, order),
+            spec(one, kind, memory, moves, special, int(urgent), loss, devices)
+            for one in (name, twin)
         ]
+        self.submit_all(specs)
+
+    @rule(name=names, then=names, start=starts, more=starts, kind=kinds, loss=losses, moves=ways)
+    def submit_in_order(
+        self, name: str, then: str, start: str, more: str, kind: str, loss: str, moves: str
+    ) -> None:
+        """Submit a process that starts after a live or a new one, and one that starts after it."""
+        known = self.cluster.state.processes.get(name)
+        first = [spec(name, "job" if "finished" in start else kind, 0, "", False, 0, loss)]
+        second = spec(f"{name}x", kind, 100, moves, False, 1, loss, "", after(name, start))
+        order = after(second.name, more)
+        third = [spec(f"{then}x", kind, 0, "", False, 0, loss, "", order)] if then != name else []
+        lives = known is not None and not known.phase.is_terminal
+        self.submit_all([*([] if lives else first), second, *third])
+
+    def submit_all(self, specs: list[ProcessSpec]) -> None:
         before = set(self.cluster.state.processes)
         if self.ask(happened.SubmissionReceived, tuple(specs)):
-            for one in (name, twin):
-                self.completed.discard(one)
-                self.failed.discard(one)
+            for one in specs:
+                self.completed.discard(one.name)
+                self.failed.discard(one.name)
         else:
             assert set(self.cluster.state.processes) == before
         self.flow()
