@@ -13,7 +13,7 @@ from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.config.start_order_forms import StartOrderInFile
 from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
-from rosrm.model.description_checks import is_namespace, name_fault
+from rosrm.model.description_checks import is_namespace, other_process_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.values import (
@@ -343,9 +343,7 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
         if not rule.processes and not rule.group:
             yield Complaint((key,), f"{key}: at least one process is required")
         for name in rule.processes:
-            fault = name_fault(name, "process")
-            if name == spec.name:
-                fault = f"{name} names itself; only other processes are allowed"
+            fault = other_process_fault(name, spec.name)
             if fault:
                 yield Complaint((key,), f"{key}: {fault}")
 
@@ -353,9 +351,7 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
 def _about_start_order(spec: ProcessSpec) -> Iterator[Complaint]:
     order = spec.start_order
     for name in order.after:
-        fault = name_fault(name, "process")
-        if name == spec.name:
-            fault = f"{name} names itself; only other processes are allowed"
+        fault = other_process_fault(name, spec.name)
         if fault:
             yield Complaint(("after", name), f"after: {fault}")
     if order != StartOrder() and not order.after:
@@ -380,9 +376,7 @@ def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
 
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
     for name in spec.talks_to:
-        fault = name_fault(name, "process")
-        if name == spec.name:
-            fault = f"{name} names itself; only other processes are allowed"
+        fault = other_process_fault(name, spec.name)
         if fault:
             yield Complaint(("talks_to", name), f"talks_to: {fault}")
 

@@ -40,6 +40,13 @@ def name_fault(name: str, what: str) -> str:
     )
 
 
+def other_process_fault(name: str, own: str) -> str:
+    """Return why a name cannot be that of another process than `own`; "" if it can."""
+    if name == own:
+        return f"{own} names itself; only other processes are allowed"
+    return name_fault(name, "process")
+
+
 def is_namespace(text: str) -> bool:
     """Return True for an absolute ROS namespace such as "/robot1"."""
     return len(text) <= _LONGEST_NAMESPACE and _NAMESPACE.fullmatch(text) is not None

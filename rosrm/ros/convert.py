@@ -18,6 +18,7 @@ from rosrm.model.description_checks import (
     is_namespace,
     is_resource_name,
     name_fault,
+    other_process_fault,
 )
 from rosrm.model.devices import (
     Device,
@@ -270,9 +271,7 @@ def _held(message: msg.Assignment | msg.ProcessStatus) -> tuple[HeldDevice, ...]
 
 def _flows_fault(message: msg.ProcessSpec) -> str:
     for flow in message.talks_to:
-        fault = name_fault(flow.process, "process")
-        if not fault and flow.process == message.name:
-            fault = f"{message.name} names itself; only other processes are allowed"
+        fault = other_process_fault(flow.process, message.name)
         if not fault and not 0.0 <= flow.rate <= values.LARGEST_RATE:
             allowed = f"0 to {values.LARGEST_RATE:g}"
             fault = f"{flow.rate} B/s with {flow.process}; allowed: {allowed}"
@@ -284,9 +283,7 @@ def _flows_fault(message: msg.ProcessSpec) -> str:
 def _start_order_fault(message: msg.ProcessSpec) -> str:
     allowed = get_args(values.StartCondition)
     for pair in message.start_order.after:
-        fault = name_fault(pair.key, "process")
-        if not fault and pair.key == message.name:
-            fault = f"{message.name} names itself; only other processes are allowed"
+        fault = other_process_fault(pair.key, message.name)
         if not fault and pair.value not in allowed:
             fault = f"{pair.key} {pair.value!r:.100}; allowed: {', '.join(allowed)}"
         if fault:

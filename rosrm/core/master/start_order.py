@@ -28,6 +28,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.pending_orders import DependencyRestart
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.dependencies import circle_fault, circle_in
+from rosrm.model.description_checks import other_process_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RestartInstance
 from rosrm.model.values import InstanceState, Kind, ProcessSpec, StartCondition
@@ -203,9 +204,8 @@ def start_order_fault(state: MasterState, starting: Sequence[ProcessSpec]) -> st
     known = {spec.name: spec for spec in starting}
     for spec in specs.values():
         for name, condition in spec.start_order.after.items():
-            fault = _dependency_fault(state, known, name, condition)
-            if name == spec.name:
-                fault = f"{name} names itself; only other processes are allowed"
+            fault = other_process_fault(name, spec.name)
+            fault = fault or _dependency_fault(state, known, name, condition)
             if fault:
                 return f"{spec.name}: after: {fault}"
     circle = circle_in(dict(_reachable(state, specs)))

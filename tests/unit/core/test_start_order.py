@@ -69,7 +69,7 @@ def test_a_process_starts_when_a_job_has_finished() -> None:
 
 
 def test_a_job_that_has_finished_counts_as_ready() -> None:
-    """It may have run for less time than a report takes."""
+    """Its run may be shorter than the time of a report."""
     cluster = Cluster("a").with_processes(job("short"))
     cluster.finish("short")
     assert cluster.submit(dependant("b", "short")).accepted
@@ -174,7 +174,7 @@ def test_neighbours_that_wait_for_each_other_by_place_and_by_start_both_start() 
 
 
 def test_no_room_is_made_for_a_process_that_waits_for_another_one() -> None:
-    """It has the highest priority."""
+    """The priority of the waiting process makes no difference."""
     cluster = Cluster(
         Machine("a", memory=1000 * 2**20), Machine("b", memory=1000 * 2**20), hysteresis=0.2
     ).with_processes(
@@ -294,7 +294,7 @@ def test_a_circle_through_processes_that_run_is_refused() -> None:
 
 
 def test_a_dependency_that_is_being_cancelled_is_refused() -> None:
-    """It has not ended yet."""
+    """The reason is not that the name is unknown."""
     cluster = Cluster("a").with_processes(process("camera"))
     cluster.machines["a"].stubborn.add("camera")
     cluster.cancel("camera")
@@ -409,7 +409,7 @@ def test_a_restart_that_is_due_survives_a_restart_of_the_master_and_a_lost_order
 
 
 def test_a_dependant_that_waits_for_its_own_restart_restarts_once() -> None:
-    """It failed because its dependency did, and is in back-off."""
+    """The end of its dependency ended it, and it is in back-off."""
     cluster = Cluster("a").with_processes(
         node("camera", restart=RestartPolicy("always")), follower("viewer", "camera")
     )
