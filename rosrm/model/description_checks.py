@@ -1,4 +1,4 @@
-"""Checks of the description of a host, sent by its slave, and of a resource, also by a probe."""
+"""Checks of names, of the description of a host by its slave, and of a resource by a probe."""
 
 from __future__ import annotations
 

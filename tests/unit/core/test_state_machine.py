@@ -362,6 +362,11 @@ class Play(RuleBasedStateMachine):
             self.failed.discard(name)
         self.flow()
 
+    @precondition(lambda self: self.cluster.state.start_orders.dependants)
+    @rule(which=which_one)
+    def restart_a_dependency(self, which: int) -> None:
+        self.restart(self.pick(list(self.cluster.state.start_orders.dependants), which))
+
     @precondition(lambda self: self.movable())
     @rule(which=which_one, seconds=st.sampled_from([1.0, 2.5, 3.5, 7.0]))
     def migrate_what_does_not_stop(self, which: int, seconds: float) -> None:
