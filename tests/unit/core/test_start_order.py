@@ -541,6 +541,21 @@ def test_the_conditions_survive_a_restart_of_the_master() -> None:
     assert cluster.phase("slam") == "running"
 
 
+def test_a_dependency_that_the_journal_has_lost_is_not_taken_for_finished() -> None:
+    """Its dependant waits, and says what helps."""
+    cluster = Cluster("a").with_processes(job("calibrate"))
+    cluster.finish("calibrate")
+    cluster.set_host("a", "cordon")
+    cluster.submit(process("driver", start_order=after(calibrate="finished")))
+    del cluster.intents["process"]["calibrate"]
+    cluster.restart_master()
+    cluster.set_host("a", "uncordon")
+    cluster.wait(1.0)
+    assert cluster["driver"].reason == (
+        "waits for calibrate to finish; calibrate does not exist: submit it again"
+    )
+
+
 def test_a_change_of_one_process_reviews_its_dependants_alone(monkeypatch) -> None:
     """A thousand others wait for other processes."""
     from rosrm.core.master import start_order
