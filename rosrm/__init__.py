@@ -25,7 +25,7 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
                 HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
-                ReschedulePolicy, ArrayMembership, Schedule
+                ReschedulePolicy, StartOrder, ArrayMembership, Schedule
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device
@@ -166,6 +166,7 @@ if TYPE_CHECKING:
         ResourceDescription,
         RestartPolicy,
         StandbyPolicy,
+        StartOrder,
         StopPolicy,
     )
 
@@ -187,8 +188,8 @@ __all__ = [
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
     "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
     "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions",
-    "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "Step", "Stop",
-    "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
+    "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "StartOrder", "Step",
+    "Stop", "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -224,7 +225,7 @@ _NAMES: Final = {
     "model.values": (
         "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
         "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
-        "ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
+        "ResourceDescription RestartPolicy StandbyPolicy StartOrder StopPolicy"
     ),
 }
 _MODULES: Final = {

@@ -14,7 +14,17 @@ from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
 from rosrm.model.schedules import NO_SCHEDULE, WEEKDAYS, Schedule
-from rosrm.model.values import Enforcement, Kind, Limits, NeighbourRule, ProcessSpec, Realtime
+from rosrm.model.values import (
+    DependencyRestartAction,
+    Enforcement,
+    Kind,
+    Limits,
+    NeighbourRule,
+    ProcessSpec,
+    Realtime,
+    StartCondition,
+    StartOrder,
+)
 
 Drawn = st.SearchStrategy[Any]
 
@@ -74,6 +84,13 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "process": PROPER_NAMES,
     "namespace": _NAMESPACES,
     "talks_to": st.dictionaries(PROPER_NAMES.map("to-{}".format), st.floats(0.0, 1e15), max_size=3),
+    "start_order": st.builds(
+        StartOrder,
+        st.dictionaries(
+            PROPER_NAMES.map("to-{}".format), st.sampled_from(get_args(StartCondition)), max_size=3
+        ),
+        st.floats(0.0, LONGEST), st.sampled_from(get_args(DependencyRestartAction)),
+    ),
     "needs": st.dictionaries(PROPER_NAMES, st.floats(0.0, 1e18), max_size=3),
     "message": PRINTABLE,
     "priority": _INT32,

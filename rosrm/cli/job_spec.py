@@ -40,10 +40,8 @@ def job_of(
         fields["working_directory"] = node_of(directory, Place("--working-directory", 0, 0))
     place = Place("run", 0, 0)
     process = Node(fields, place, place)
-    (spec,) = checked_work(
-        Node({"processes": Node((process,), place, place)}, place), "run", registry=None
-    )
-    return spec
+    work = Node({"processes": Node((process,), place, place)}, place)
+    return checked_work(work, "run", registry=None).specs[0]
 
 
 def _name_of(program: str) -> str:

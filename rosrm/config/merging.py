@@ -93,6 +93,15 @@ def _neighbours(node: Node) -> Node:
     return Node(rules, node.place, node.key_place)
 
 
+def _after(node: Node) -> Node:
+    """Convert `camera` and `[camera, lidar]` to `{camera: ready, lidar: ready}`."""
+    items = node.value if isinstance(node.value, tuple) else (node,)
+    if isinstance(node.value, Mapping) or not all(isinstance(one.value, str) for one in items):
+        return node
+    members = {str(one.value): Node("ready", one.place) for one in items}
+    return Node(members, node.place, node.key_place)
+
+
 _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "restart": _word("when"),
     "migration": _word("strategy"),
@@ -106,4 +115,5 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "spread": _word("by"),
     "at": _list,
     "on": _list,
+    "after": _after,
 }

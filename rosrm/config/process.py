@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
+from rosrm.config.start_order_forms import StartOrderInFile
 from rosrm.extensions.units import (
     Amount,
     ByteRate,
@@ -21,7 +22,7 @@ from rosrm.extensions.units import (
     Seconds,
 )
 from rosrm.model.arrays import INDEX_PLACEHOLDER, ArrayMembership
-from rosrm.model.description_checks import is_namespace, name_fault
+from rosrm.model.description_checks import is_namespace, other_process_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
@@ -47,6 +48,7 @@ from rosrm.model.values import (
     RestartCondition,
     RestartPolicy,
     StandbyPolicy,
+    StartOrder,
     StopPolicy,
 )
 from rosrm.wording import listed
@@ -238,6 +240,7 @@ class ProcessInFile:
     every: Annotated[float, Quantity("duration", low=SHORTEST, hint="seconds")] = 0.0
     at: tuple[str, ...] = ()
     on: tuple[str, ...] = ()
+    after: Annotated[StartOrder, StartOrderInFile()] = field(default_factory=StartOrder)
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -268,6 +271,7 @@ class ProcessInFile:
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
             array=self._membership(),
             schedule=_same(Schedule, self),
+            start_order=self.after,
             given=(),
         )
 
@@ -401,11 +405,20 @@ def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
         if not rule.processes and not rule.group:
             yield Complaint((key,), f"{key}: at least one process is required")
         for name in rule.processes:
-            fault = name_fault(name, "process")
-            if name == spec.name:
-                fault = f"{name} names itself; only other processes are allowed"
+            fault = other_process_fault(name, spec.name)
             if fault:
                 yield Complaint((key,), f"{key}: {fault}")
+
+
+def _about_start_order(spec: ProcessSpec) -> Iterator[Complaint]:
+    order = spec.start_order
+    for name in order.after:
+        fault = other_process_fault(name, spec.name)
+        if fault:
+            yield Complaint(("after", name), f"after: {fault}")
+    if order != StartOrder() and not order.after:
+        text = "after: the name of at least one process is required"
+        yield Complaint(("after",), text)
 
 
 def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -425,9 +438,7 @@ def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
 
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
     for name in spec.talks_to:
-        fault = name_fault(name, "process")
-        if name == spec.name:
-            fault = f"{name} names itself; only other processes are allowed"
+        fault = other_process_fault(name, spec.name)
         if fault:
             yield Complaint(("talks_to", name), f"talks_to: {fault}")
 
@@ -536,6 +547,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_start_order, ("name", "after")),
     (_about_devices, ("devices", "arguments", "parameters")),
     (_about_flows, ("name", "talks_to")),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),

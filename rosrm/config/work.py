@@ -19,6 +19,7 @@ from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, sett
 from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
 from rosrm.model.applications import RolloutPolicy, Target
+from rosrm.model.dependencies import circle_fault, circle_in
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
@@ -27,8 +28,8 @@ _SECTIONS: Final = ("app", "rollout", "processes", "defaults")
 _NOT_IN_DEFAULTS: Final = ("name", "foreach", "array", "parallel")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
 _NOT_IN_CLUSTER_DEFAULTS: Final = (
-    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "retries", "every", "at",
-    "on",
+    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "after", "retries",
+    "every", "at", "on",
 )  # fmt: skip
 
 
@@ -86,6 +87,7 @@ def checked_work(root: Node, path: str | Path, registry: Registry | None) -> Tar
         for node in expanded(_with_group(merged(defaults, written_out(entry))), problems)
     ]
     specs = [_process(node, path, plugins, problems) for node in nodes]
+    _refuse_circle(nodes, specs, problems)
     refuse_namesakes(nodes, "process", problems)
     problems.raise_any()
     parts = tuple(replace(spec, application=application) for spec in specs if spec is not None)
@@ -205,6 +207,19 @@ def _process(
     if fault:
         problems.add(node.deepest(("standby",)).place, fault)
     return spec
+
+
+def _refuse_circle(
+    nodes: Sequence[Node], specs: Sequence[ProcessSpec | None], problems: Problems
+) -> None:
+    """Note a circle of processes that start after each other, at the first of them."""
+    known = {spec.name: node for node, spec in zip(nodes, specs, strict=True) if spec is not None}
+    after = {spec.name: list(spec.start_order.after) for spec in specs if spec is not None}
+    if problems:
+        return  # a process that names itself is noted already
+    circle = circle_in(after)
+    if circle:
+        problems.add(known[circle[0]].deepest(("after", circle[1])).place, circle_fault(circle))
 
 
 def _given(node: Node, value: Any, before: str = "") -> Iterator[str]:

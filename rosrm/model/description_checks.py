@@ -1,4 +1,4 @@
-"""Checks of the description of a host, sent by its slave, and of a resource, also by a probe."""
+"""Checks of names, of the description of a host by its slave, and of a resource by a probe."""
 
 from __future__ import annotations
 
@@ -38,6 +38,13 @@ def name_fault(name: str, what: str) -> str:
         f"{name!r:.250} cannot be the name of a {what}. Allowed: at most 200 letters, digits, "
         "'_', '-' and '.', the first of them a letter, digit or '_'"
     )
+
+
+def other_process_fault(name: str, own: str) -> str:
+    """Return why a name cannot be that of another process than `own`; "" if it can."""
+    if name == own:
+        return f"{own} names itself; only other processes are allowed"
+    return name_fault(name, "process")
 
 
 def is_namespace(text: str) -> bool:

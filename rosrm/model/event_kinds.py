@@ -63,6 +63,14 @@ class EventKind(str, Enum):
         "run_skipped",
         "the former run of the job has not ended at the time of the next one",
     )
+    DEPENDENCY_RESTARTED = (
+        "dependency_restarted",
+        "the process is restarted, because a process after which it starts was restarted",
+    )
+    DEPENDANTS_LEFT = (
+        "dependants_left",
+        "the process is stopped before those that start after it, which did not end in time",
+    )
     INSTANCE_ENDED = "instance_ended", "an instance that does not own the name of its process ended"
     UNASSIGNED_STOPPED = "unassigned_stopped", "a host runs an instance that the master stops"
     FENCED = "fenced", "a host runs an instance that has a successor: it is killed"

@@ -38,6 +38,8 @@ IsolationAction = Literal["keep", "stop"]
 Accounting = Literal["attributed", "shared", "countable"]
 Relation = Literal["near", "apart"]
 Enforcement = Literal["preferred", "required"]
+StartCondition = Literal["ready", "finished"]
+DependencyRestartAction = Literal["ignore", "restart"]
 #: "": the default scheduling of the operating system.
 RealtimePolicy = Literal["", "fifo", "rr"]
 
@@ -201,6 +203,23 @@ class NeighbourRule:
 
 
 @dataclass(frozen=True, slots=True)
+class StartOrder:
+    """Start of a process after other processes, its dependencies.
+
+    Attributes:
+        after: name of each dependency to its condition: "ready" (it is ready, or is a job that has
+            finished) or "finished" (it ended with success).
+        delay: seconds from the time since when all conditions hold to the start.
+        on_restart: "restart": when a dependency was restarted, the process is restarted in place as
+            soon as all conditions hold again; "ignore": it runs on.
+    """
+
+    after: Mapping[str, StartCondition] = field(default_factory=lambda: EMPTY)
+    delay: float = 0.0
+    on_restart: DependencyRestartAction = "ignore"
+
+
+@dataclass(frozen=True, slots=True)
 class Limits:
     """Limits of a process that its host enforces; 0: no limit.
 
@@ -277,6 +296,7 @@ class ProcessSpec:
         array: the array of a job, and its index there.
         schedule: times at which a job starts again.
         application: name of the application of which it is a part; "": it is a single process.
+        start_order: the processes after which it starts.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -320,6 +340,7 @@ class ProcessSpec:
     array: ArrayMembership = NO_ARRAY
     schedule: Schedule = NO_SCHEDULE
     application: str = ""
+    start_order: StartOrder = StartOrder()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

@@ -62,6 +62,7 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.neighbours": 256,
     "NeighbourRule.processes": 1024,
     "ProcessSpec.talks_to": 256,
+    "StartOrder.after": 256,
     "ProcessStatusBatch.failing": 1000,
     "ProcessUsage.others": 16,
     "Sealed.body": 1 << 24,

@@ -19,6 +19,7 @@ from rosrm.model.description_checks import (
     is_namespace,
     is_resource_name,
     name_fault,
+    other_process_fault,
 )
 from rosrm.model.devices import (
     Device,
@@ -97,6 +98,7 @@ _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     tuple[str, ...]: (list, tuple),
     tuple[int, ...]: (list, lambda numbers: tuple(map(int, numbers))),
     Mapping[str, str]: (pairs, mapping),
+    Mapping[str, values.StartCondition]: (pairs, mapping),
     values.Kind: (attrgetter("value"), values.Kind),
     values.InstanceState: (attrgetter("value"), values.InstanceState),
 }
@@ -248,6 +250,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _neighbours_fault(message)
         or _devices_fault(message)
         or _flows_fault(message)
+        or _start_order_fault(message)
     )
 
 
@@ -304,14 +307,23 @@ def _held(message: msg.Assignment | msg.ProcessStatus) -> tuple[HeldDevice, ...]
 
 def _flows_fault(message: msg.ProcessSpec) -> str:
     for flow in message.talks_to:
-        fault = name_fault(flow.process, "process")
-        if not fault and flow.process == message.name:
-            fault = f"{message.name} names itself; only other processes are allowed"
+        fault = other_process_fault(flow.process, message.name)
         if not fault and not 0.0 <= flow.rate <= values.LARGEST_RATE:
             allowed = f"0 to {values.LARGEST_RATE:g}"
             fault = f"{flow.rate} B/s with {flow.process}; allowed: {allowed}"
         if fault:
             return f"talks_to: {fault}"
+    return ""
+
+
+def _start_order_fault(message: msg.ProcessSpec) -> str:
+    allowed = get_args(values.StartCondition)
+    for pair in message.start_order.after:
+        fault = other_process_fault(pair.key, message.name)
+        if not fault and pair.value not in allowed:
+            fault = f"{pair.key} {pair.value!r:.100}; allowed: {', '.join(allowed)}"
+        if fault:
+            return f"after: {fault}"
     return ""
 
 
@@ -321,6 +333,11 @@ def _word_fault(message: msg.ProcessSpec) -> str:
         ("readiness", message.readiness.kind, get_args(values.ReadinessKind)),
         ("host_loss", message.host_loss.then, get_args(values.HostLossAction)),
         ("isolation", message.isolation.then, get_args(values.IsolationAction)),
+        (
+            "after.on_restart",
+            message.start_order.on_restart,
+            get_args(values.DependencyRestartAction),
+        ),
     )
     for name, given, allowed in words:
         if given not in allowed:
@@ -342,6 +359,7 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "health.timeout": message.health.timeout,
         "reschedule.delay": message.reschedule.delay,
         "time_limit": message.time_limit,
+        "after.delay": message.start_order.delay,
     }
     for name, seconds in times.items():
         if not 0.0 <= seconds <= LONGEST:

@@ -30,7 +30,7 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
         show(overview.render(snapshot))
 
 
-def ps(
+def ps(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     everything: Annotated[
         bool, typer.Option("--all", "-a", help="List finished and cancelled processes too.")

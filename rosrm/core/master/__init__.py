@@ -8,6 +8,7 @@ requests.py    requests of clients; rights.py, quotas.py, contradictions.py, pro
                pruning.py, graph_names.py
 answers.py     answers of slaves to orders; reloading.py
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
+start_order.py starts after other processes, stops before them; dependants.py
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
 scheduling/    choice of a host for a process: filter, score, pick
 assignment/    assignment of waiting processes, reservation of their load

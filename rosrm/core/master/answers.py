@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rosrm.core.master import events as happened
-from rosrm.core.master import reloading
+from rosrm.core.master import reloading, start_order
 from rosrm.core.master.applications import restart_policies
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities, links
@@ -11,6 +11,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import steps
 from rosrm.core.master.state.pending_orders import (
     CapabilityQuery,
+    DependencyRestart,
     ImageRemoval,
     LinkMeasurement,
     MigrationStep,
@@ -41,5 +42,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             links.note_answer(state, host, event, now)
         case Reload(host):
             reloading.note_answer(state, host, event, now)
+        case DependencyRestart():
+            start_order.note_answer(state, purpose, event)
         case ImageRemoval(number):
             images.note_answer(state, number, event, now)

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
+from rosrm.core.master import dependants
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
 from rosrm.core.master.assignment.reservations import learn_from, settle_reservation
@@ -131,7 +132,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     if instance is None or instance.host is not host or instance.id != status.instance:
         _handle_unknown_instance(state, host, status, now)
         return
-    before = instance.state
+    before, pid = instance.state, instance.pid
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
     instance.enforced = status.enforced
     _note_load(state, instance, before, now)
@@ -150,12 +151,11 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     if status.state in _ALIVE and not process.began:
         _note_start(state, process, now)
-    if process.restarts != status.restarts:
-        process.phase_before_loss = None  # restarted while its host was silent
-        note_run(process, status)  # of the run before the restart
-    process.restarts = status.restarts
+    _note_restarts(state, process, status, before, pid)
     if process.wanted is not DesiredState.RUN and not instance.stopping:
-        stop_instance(state, instance, now)
+        stop_owner(state, process, instance, now)
+        if not instance.stopping:
+            return
     if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
         stop_instance(state, instance, now)  # the standby is ready sooner, and has the snapshot
     if process.name not in state.migrations:
@@ -168,6 +168,34 @@ def _note_start(state: MasterState, process: Process, now: float) -> None:
     if process.spec.schedule and not process.next_run:
         process.next_run = process.spec.schedule.next_run(state.wall)
     state.save(process)
+
+
+def _note_restarts(
+    state: MasterState, process: Process, status: InstanceStatus, before: InstanceState | None,
+    pid: int,
+) -> None:  # fmt: skip
+    """Note the restarts of a process; the arguments are those of `_is_another_run`."""
+    if _is_another_run(process, status, before, pid):
+        dependants.note_restart(state, process)
+    if process.restarts != status.restarts:
+        process.phase_before_loss = None  # restarted while its host was silent
+        note_run(process, status)  # of the run before the restart
+    process.restarts = status.restarts
+
+
+def _is_another_run(
+    process: Process, status: InstanceStatus, before: InstanceState | None, pid: int
+) -> bool:
+    """Return True if a status shows that the owner of a process was restarted.
+
+    `before`, `pid`: state and pid in its former status. A restart that a user ordered does not
+    change the number of restarts.
+    """
+    if before is InstanceState.STOPPING:
+        return status.state is not InstanceState.STOPPING
+    ended = before in (InstanceState.RUNNING, InstanceState.READY) and status.state in _DOWN
+    other_pid = pid and status.pid and pid != status.pid
+    return bool(ended or other_pid or status.restarts > process.restarts)
 
 
 def _follow(
@@ -239,6 +267,12 @@ def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: flo
     adopted = state.add_instance(instance, host, now, NO_NEEDS)
     adopted.stopping = True
     return adopted
+
+
+def stop_owner(state: MasterState, process: Process, owner: Instance, now: float) -> None:
+    """Order the owner of a process to stop, unless other processes must end before."""
+    if not dependants.waits_for_ends(state, process, now):
+        stop_instance(state, owner, now)
 
 
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
@@ -475,6 +509,8 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
         if state.hosts.condition_of(host) is HostCondition.DETACHED:
             where, ends = f": waits for {host.name}, whose slave was stopped", ""
         what = "being stopped after its time limit" if process.overdue else "being cancelled"
+        if not owner.stopping:
+            ends += dependants.described_wait(state, process)
         state.set_phase(process, ProcessPhase.STOPPING, now, f"{what}{where}{ends}")
     elif unreachable:
         lost = state.hosts.condition_of(host) is HostCondition.LOST

@@ -245,11 +245,13 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return row.reason
     if process.name in state.neighbours.separated:
         return state.neighbours.separated[process.name][0]
+    if process.name in state.queue.awaiting:
+        return process.reason
     if position and (awaited := awaited_neighbour(state, process)):
         return awaited
     made = state.preemption.room_made.get(process.name) if position else None
     room = made.reason if made is not None else ""
-    if position <= 1 or room:
+    if position <= 1 or room or state.queue.head() == process.name:
         owner = state.instances.get(process.owner)
         reason = _reason_of_phase(state, process) or _awaited_node(process, owner)
         return f"{reason}; {room}" if room and room != reason else reason

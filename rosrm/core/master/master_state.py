@@ -36,6 +36,7 @@ from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, P
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
+from rosrm.core.master.state.start_orders import StartOrders
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import ChainOf, PlacementPlugins
@@ -137,6 +138,7 @@ class MasterState:
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
         self.neighbours = NeighbourRules()
+        self.start_orders = StartOrders()
         self.flows = Flows()
         self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
@@ -309,6 +311,7 @@ class MasterState:
             phase, reason = self._after_run(process, phase, reason)
         if process.phase is not phase:
             self._begin_phase(process, phase, now)
+            self.start_orders.note_change(process.name)
         process.reason = reason
         self._update_terminal(process)
 
@@ -342,6 +345,7 @@ class MasterState:
         self.processes.pop(process.name, None)  # listings are in order of submission
         self.processes[process.name] = process
         self._update_terminal(process)
+        self.start_orders.note_change(process.name)
 
     def _update_terminal(self, process: Process) -> None:
         """Update `terminal`, which stays in the order in which processes ended."""
@@ -355,6 +359,8 @@ class MasterState:
                 self.wants_standby.setdefault(process.name)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
+            if process.spec.start_order.after:
+                self.start_orders.add(process.spec)
             self.flows.declare(process.name, process.spec.talks_to)
         else:
             self.terminal.setdefault(process.name)
@@ -362,6 +368,7 @@ class MasterState:
             self.time_limited.pop(process.name, None)
             self.scheduled.pop(process.name, None)
             self.neighbours.remove(process.name)
+            self.start_orders.remove(process.name)
             self.flows.remove(process.name)
 
     def set_spec(self, process: Process, spec: ProcessSpec) -> None:
@@ -375,13 +382,15 @@ class MasterState:
         self.time_limited.pop(process.name, None)
         self.scheduled.pop(process.name, None)
         self.neighbours.remove(process.name)
+        self.start_orders.remove(process.name)
         self._update_terminal(process)
         if in_line:
             self.put_in_queue(process)
+        self.start_orders.note_change(process.name)
         self.save(process)
 
     def collect_garbage(self) -> None:
-        """Remove terminal processes beyond the newest `keep_ended`, unless one may still run."""
+        """Remove terminal processes beyond the newest `keep_ended` that may be removed."""
         excess = len(self.terminal) - self.settings.keep_ended
         if excess <= 0:
             return
@@ -390,8 +399,15 @@ class MasterState:
             self.remove_process(name)
 
     def is_gone(self, process: Process) -> bool:
-        """Return True if neither an instance nor a standby of a terminal process may run."""
-        return not process.instances and process.name not in self.standbys
+        """Return True if a terminal process may be removed.
+
+        Neither an instance nor a standby of it may run, and no live process starts after it.
+        """
+        return not self.may_run(process) and process.name not in self.start_orders.dependants
+
+    def may_run(self, process: Process) -> bool:
+        """Return True if an instance or a standby of a process may run."""
+        return bool(process.instances) or process.name in self.standbys
 
     def remove_process(self, name: str) -> None:
         """Remove a terminal process from memory and journal; none of its instances may run."""
@@ -421,6 +437,7 @@ class MasterState:
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue = DesiredState.RUN, False
         process.started_at, process.began = inf, 0.0
+        process.restart_due = False
         self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.put_in_queue(process)
@@ -443,6 +460,7 @@ class MasterState:
 
     def _put_in_queue(self, process: Process) -> None:
         self.queue.add(process.name, process.spec.priority, process.order)
+        self.start_orders.note_change(process.name)
         if process.queue_delay:
             self.queue.delayed.add(process.name)
 

@@ -16,7 +16,7 @@ from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent
 from rosrm.model.requester import Requester
-from rosrm.wording import counted, listed
+from rosrm.wording import counted, each_of, listed
 
 _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 
@@ -66,6 +66,10 @@ def _why_not_pruned(state: MasterState, process: Process) -> str:
     if process.instances:
         instance = state.instances[min(process.instances)]
         return f"{instance.id} is still being stopped on {instance.host.name}"
+    if process.name in state.start_orders.dependants:
+        names = list(state.start_orders.dependants[process.name])
+        after = f"{each_of(names)} starts after {process.name}, and has not ended"
+        return f"{after}; cancel {listed(names)} first"
     return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
 
 

@@ -46,6 +46,7 @@ from rosrm.core.master import (
     pruning,
     reloading,
     requests,
+    start_order,
     tick,
 )
 from rosrm.core.master import events as happened
@@ -110,6 +111,7 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
         assert isinstance(event, happened.Request)
         state.emit(Reply(event.request, False, refusal.code, str(refusal)))
     executor.advance_all(state, now)
+    start_order.review(state, now)
     place_waiting(state, now)
     plugin_failures.note(state, now)
     return state.take()

@@ -12,6 +12,7 @@ from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
+from rosrm.core.master.dependants import dependants_first
 from rosrm.core.master.graph_names import shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import MasterState
@@ -25,6 +26,7 @@ from rosrm.core.master.rescheduling import allow_every_host
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.schedules import await_first_run, queue_again
 from rosrm.core.master.scheduling.feasibility import unknown_resources
+from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
@@ -60,6 +62,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
     specs = [spec for spec, _ in filled]
     fault = submission_fault(state, filled, len(filled)) or neighbour_fault(state, specs)
+    fault = fault or start_order_fault(state, specs)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_quota(state, specs, event.by)
@@ -268,7 +271,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
     """Remove processes from the queue, or stop them."""
     processes = known_processes(state, event.names, event.by)
     terminal = [process.name for process in processes if process.phase.is_terminal]
-    for process in processes:
+    for process in dependants_first(state, processes):
         if not process.phase.is_terminal:
             cancel_process(state, process, now, event.by)
     state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
@@ -319,7 +322,7 @@ def cancel_process(state: MasterState, process: Process, now: float, by: Request
     elif process.name not in state.migrations:  # otherwise the plan is undone first
         owner = state.instances[process.owner]
         lifecycle.note_phase(state, process, owner, now)
-        lifecycle.stop_instance(state, owner, now)
+        lifecycle.stop_owner(state, process, owner, now)
     state.save(process)
 
 
@@ -330,10 +333,11 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
         fault = _restart_fault(state, process)
         if fault:
             raise RequestRefused(f"{fault}. Nothing was restarted")
-    ended = (
-        one.spec for one in processes if one.phase.is_terminal and one.principal == event.by.name
-    )
-    check_quota(state, ended, event.by)
+    ended = [one for one in processes if one.phase.is_terminal]
+    fault = start_order_fault(state, [one.spec for one in ended])
+    if fault:
+        raise RequestRefused(f"{fault}. Nothing was restarted")
+    check_quota(state, (one.spec for one in ended if one.principal == event.by.name), event.by)
     for process in processes:
         _restart(state, process, now, event.by)
     state.emit(Reply(event.request, message=f"{count(len(processes))} restarted"))

@@ -24,6 +24,7 @@ from rosrm.core.master.migration.reunion import review_separated
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.schedules import review_schedules
+from rosrm.core.master.start_order import review_stops
 from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.time_limits import review_time_limits
 from rosrm.model.orders import ReportInstances
@@ -48,6 +49,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     rollout.review(state, now)
     review_time_limits(state, now)
     review_schedules(state, now)
+    review_stops(state, now)
     review_departures(state, now)
     review_lost_hosts(state, now)
     journal_gap.review(state, now)

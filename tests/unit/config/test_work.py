@@ -20,6 +20,7 @@ from rosrm.model.values import (
     Readiness,
     Realtime,
     RestartPolicy,
+    StartOrder,
     StopPolicy,
 )
 from tests.plugin_kit import registry_of
@@ -35,7 +36,8 @@ def one(path):
 def test_every_key_of_a_process_reaches_its_spec():
     """A key that is only in the form of the file would be accepted without an effect."""
     in_file = {field.name for field in fields(ProcessInFile)}
-    others = {"labels", "near", "apart", "spread", "parallel", "retries", "every", "at", "on"}
+    others = {"labels", "near", "apart", "spread", "after"}
+    others |= {"parallel", "retries", "every", "at", "on"}
     assert in_file - {field.name for field in fields(ProcessSpec)} == others
 
 
@@ -127,6 +129,14 @@ def test_every_key_is_read(file):
             "realtime",
             Realtime("fifo", 40),
         ),
+        ("command: x, after: b", "start_order", StartOrder({"b": "ready"})),
+        ("command: x, after: [b, c]", "start_order", StartOrder({"b": "ready", "c": "ready"})),
+        (
+            "command: x, after: {b: finished, delay: 500ms, on_restart: restart}",
+            "start_order",
+            StartOrder({"b": "finished"}, 0.5, "restart"),
+        ),
+        ("command: x, after: []", "start_order", StartOrder()),
         ("module: m", "ros", False),
         ("module: m, ros: true, remappings: [[a, b]]", "remappings", {"a": "b"}),
     ],
@@ -168,6 +178,22 @@ def test_the_processes_of_one_entry_are_one_group(file):
         ("talks_to: {b: -1MB/s}", "talks_to.b: '-1MB/s' is not within 0..1e+15"),
         ("talks_to: {b: 30MB}", "talks_to.b: unknown unit 'MB'; did you mean 'MB/s'?"),
         ("talks_to: [b]", "talks_to: a mapping is required, not a list"),
+        ("after: a", "after: a names itself; only other processes are allowed"),
+        ("after: [../b]", "after: '../b' cannot be the name of a process"),
+        (
+            "after: {b: started}",
+            'after.b: "started" is unknown. Allowed: ready, finished',
+        ),
+        (
+            "after: {b: ready, delay: soon}",
+            "after.delay: 'soon' is not a number, or text such as \"500ms\"",
+        ),
+        (
+            "after: {b: ready, on_restart: restarts}",
+            "after.on_restart: \"restarts\" is unknown; did you mean 'restart'?",
+        ),
+        ("after: {delay: 2s}", "after: the name of at least one process is required"),
+        ("after: 5", "after: a mapping is required, not 5"),
         ("near: [[b]]", "near[0].processes[0]: text is required, not a list"),
         ("spread: {groups: g}", "unknown key 'groups' in spread; did you mean 'group'?"),
         ("near: {processes: [b], prefer: 1}", "near[0].prefer: true or false is required, not 1"),
@@ -183,6 +209,41 @@ def test_faults_of_neighbours_are_named(file, entry, text):
     with pytest.raises(ConfigError) as error:
         load_work(path)
     assert text in str(error.value)
+
+
+def test_a_circle_of_starts_is_refused_at_its_place(file):
+    """The chain names all processes of the circle."""
+    path = file(
+        """
+        defaults: {command: x}
+        processes:
+          - {name: a, after: {other: ready, b: finished}}
+          - {name: b, after: [c]}
+          - {name: c, after: a}
+        """
+    )
+    with pytest.raises(ConfigError) as error:
+        load_work(path)
+    (line,) = str(error.value).splitlines()
+    assert "a -> b -> c -> a is a circle, in which each process starts after the next" in line
+
+
+def test_a_start_order_of_an_entry_for_many_processes(file):
+    """The values of `foreach` are filled into names; defaults lie under them."""
+    specs = load_work(
+        file(
+            """
+            defaults: {command: x, after: {delay: 2s}}
+            processes:
+              - {name: "view_{i}", foreach: {i: [1, 2]}, after: "cam_{i}"}
+              - {name: map, after: {"view_{x}": finished}, foreach: [{x: 1}]}
+            """
+        )
+    )
+    assert [spec.start_order for spec in specs] == [
+        StartOrder({"cam_1": "ready"}, 2.0), StartOrder({"cam_2": "ready"}, 2.0),
+        StartOrder({"view_1": "finished"}, 2.0),
+    ]  # fmt: skip
 
 
 def test_defaults_lie_under_each_process_in_depth(file):

@@ -19,6 +19,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import demand_of
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.core.master.state.process import DesiredState, ProcessPhase
 from rosrm.core.slave import events
@@ -37,6 +38,7 @@ from rosrm.model.values import (
     RestartPolicy,
     SnapshotReport,
     StandbyPolicy,
+    StartOrder,
 )
 from tests.unit.core import invariants
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
@@ -56,6 +58,9 @@ ways = st.sampled_from(
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
+kinds = st.sampled_from(["service", "job", "node", "node"])
+#: Start orders that a process may have, to be completed with a dependency.
+starts = st.sampled_from(["ready", "finished", "ready, later", "ready, restart"])
 asked = st.sampled_from(["", "", "camera", "gpu", "half gpu", "half gpu"])
 NEEDS = {
     "": (),
@@ -88,7 +93,7 @@ def is_open(hosts: HostTable, column: int) -> bool:
 
 def spec(
     name: str, kind: str, memory: int, moves: str, special: bool, priority: int,
-    loss: str = "wait", devices: str = "",
+    loss: str = "wait", devices: str = "", start_order: StartOrder | None = None,
 ) -> ProcessSpec:  # fmt: skip
     """Draw one of a few sorts of process."""
     word = moves.partition(",")[0]
@@ -107,7 +112,23 @@ def spec(
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
         devices=NEEDS[devices], array=ArrayMembership("r", 0, 2) if kind == "job" else NO_ARRAY,
         schedule=Schedule(every=4.0) if kind == "job" and memory == 300 else NO_SCHEDULE,
+        start_order=start_order or StartOrder(),
     )  # fmt: skip
+
+
+def after(name: str, start: str) -> StartOrder:
+    """Return a start order after one process."""
+    condition, _, more = start.partition(", ")
+    on_restart = "restart" if more == "restart" else "ignore"
+    return StartOrder({name: condition}, 1.0 if more == "later" else 0.0, on_restart)
+
+
+def holds(state: MasterState, name: str, condition: str) -> bool:
+    """Return True if a process meets the condition of a start order."""
+    process = state.processes[name]
+    if process.phase is ProcessPhase.FINISHED:
+        return condition == "finished" or process.spec.kind is Kind.JOB
+    return process.phase is ProcessPhase.RUNNING and condition == "ready"
 
 
 class OneOther:
@@ -194,8 +215,16 @@ class Play(RuleBasedStateMachine):
             assert not (over > 1e-6).any(), "assigned over a limit"
             assert is_open(state.hosts, column), "assigned to a host that is closed"
             assert state.hosts.processes[column] <= state.hosts.bound[column]
+            self.look_at_dependencies(assign)
         self.look_at_order(given)
         self.look_at_states(given)
+
+    def look_at_dependencies(self, assign: Assign) -> None:
+        """Check that no process starts before its dependencies hold."""
+        state, order = self.cluster.state, assign.assignment.spec.start_order
+        for name, condition in order.after.items():
+            assert holds(state, name, condition), (name, condition)
+            assert self.cluster.now >= state.processes[name].since + order.delay
 
     def look_at_states(self, given: list[Assign]) -> None:
         """Check that no process starts from nothing if a connected host reported its snapshot."""
@@ -220,6 +249,8 @@ class Play(RuleBasedStateMachine):
             for name in state.queue:
                 waits = state.processes[name]
                 if awaits_states(state, waits, self.cluster.now) or name in state.queue.delayed:
+                    continue
+                if name in state.queue.awaiting:
                     continue
                 ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
                 alike = demand_of(state, waits).key == demand_of(state, chosen).key
@@ -276,7 +307,7 @@ class Play(RuleBasedStateMachine):
     # --- users ---------------------------------------------------------------------------
 
     @rule(
-        name=names, kind=st.sampled_from(["service", "job", "node", "node"]),
+        name=names, kind=kinds,
         memory=st.sampled_from([0, 100, 100, 300]),
         moves=ways | st.just(""),
         special=chance, urgent=chance, twin=names, loss=losses, devices=asked,
@@ -290,11 +321,27 @@ class Play(RuleBasedStateMachine):
             spec(one, kind, memory, moves, special, int(urgent), loss, devices)
             for one in (name, twin)
         ]
+        self.submit_all(specs)
+
+    @rule(name=names, then=names, start=starts, more=starts, kind=kinds, loss=losses, moves=ways)
+    def submit_in_order(
+        self, name: str, then: str, start: str, more: str, kind: str, loss: str, moves: str
+    ) -> None:
+        """Submit a process that starts after a live or a new one, and one that starts after it."""
+        known = self.cluster.state.processes.get(name)
+        first = [spec(name, "job" if "finished" in start else kind, 0, "", False, 0, loss)]
+        second = spec(f"{name}x", kind, 100, moves, False, 1, loss, "", after(name, start))
+        order = after(second.name, more)
+        third = [spec(f"{then}x", kind, 0, "", False, 0, loss, "", order)] if then != name else []
+        lives = known is not None and not known.phase.is_terminal
+        self.submit_all([*([] if lives else first), second, *third])
+
+    def submit_all(self, specs: list[ProcessSpec]) -> None:
         before = set(self.cluster.state.processes)
         if self.ask(happened.SubmissionReceived, tuple(specs)):
-            for one in (name, twin):
-                self.completed.discard(one)
-                self.failed.discard(one)
+            for one in specs:
+                self.completed.discard(one.name)
+                self.failed.discard(one.name)
         else:
             assert set(self.cluster.state.processes) == before
         self.flow()
@@ -302,6 +349,12 @@ class Play(RuleBasedStateMachine):
     @rule(name=names)
     def cancel(self, name: str) -> None:
         self.ask(happened.CancelRequested, (name,))
+        self.flow()
+
+    @rule()
+    def cancel_all(self) -> None:
+        """Cancel all at once, in the reverse order of their starts."""
+        self.ask(happened.CancelRequested, tuple(self.cluster.state.processes))
         self.flow()
 
     @rule(name=names)
@@ -312,6 +365,11 @@ class Play(RuleBasedStateMachine):
             self.completed.discard(name)
             self.failed.discard(name)
         self.flow()
+
+    @precondition(lambda self: self.cluster.state.start_orders.dependants)
+    @rule(which=which_one)
+    def restart_a_dependency(self, which: int) -> None:
+        self.restart(self.pick(list(self.cluster.state.start_orders.dependants), which))
 
     @precondition(lambda self: self.movable())
     @rule(which=which_one, seconds=st.sampled_from([1.0, 2.5, 3.5, 7.0]))
@@ -849,6 +907,23 @@ class Play(RuleBasedStateMachine):
             self.newest[name] = (born, newest)
 
     @invariant()
+    def what_waits_for_others_can_be_found(self) -> None:
+        """Check the index of start orders against the specs."""
+        state = self.cluster.state
+        orders = {
+            process.name: process.spec.start_order
+            for process in state.processes.values()
+            if process.spec.start_order.after and not process.phase.is_terminal
+        }
+        assert state.start_orders.declared == orders
+        assert {
+            (name, one) for name, found in state.start_orders.dependants.items() for one in found
+        } == {(name, one) for one, order in orders.items() for name in order.after}
+        assert state.queue.awaiting <= orders.keys()
+        for name in state.start_orders.last_to_stop:
+            assert state.processes[name].wanted is DesiredState.CANCEL
+
+    @invariant()
     def an_end_is_told_as_it_was(self) -> None:
         """Check that each finished or failed process really ended so."""
         for process in self.cluster.state.processes.values():
@@ -892,6 +967,9 @@ class Play(RuleBasedStateMachine):
                 where.remove(cluster.state.standbys[process.name].destination_host.name)
             assert len(where) == (process.phase is ProcessPhase.RUNNING), (process.name, where)
             assert cluster.active(process.name) == where
+            if process.phase is ProcessPhase.RUNNING and process.restart_due:
+                conditions = process.spec.start_order.after.items()
+                assert not all(holds(cluster.state, *one) for one in conditions), process.name
         self._cancel_all()
 
     def _let_nodes_come_up(self, times: int) -> None:

@@ -197,6 +197,10 @@ def neighbour(**fields: object) -> list[msg.NeighbourRule]:
     return [msg.NeighbourRule(**{"relation": "near", "processes": ["q"], **fields})]
 
 
+def pair(key: str, text: str) -> msg.KeyValue:
+    return msg.KeyValue(key=key, value=text)
+
+
 NAN, INF = float("nan"), float("inf")
 
 
@@ -259,6 +263,12 @@ NONSENSE_IN_SPECS = {
     ),
     "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
+    "a start after itself": lambda m: setattr(m.start_order, "after", [pair("p", "ready")]),
+    "a start after a path": lambda m: setattr(m.start_order, "after", [pair("../q", "ready")]),
+    "a condition": lambda m: setattr(m.start_order, "after", [pair("q", "started")]),
+    "many starts": lambda m: setattr(m.start_order, "after", [pair("q", "ready")] * 257),
+    "a start without end": lambda m: setattr(m.start_order, "delay", NAN),
+    "a restart with others": lambda m: setattr(m.start_order, "on_restart", "perhaps"),
     "a device of no kind": lambda m: setattr(m, "devices", asked(kind="")),
     "a share that is no number": lambda m: setattr(m, "devices", asked(amount=NAN)),
     "a share of two units": lambda m: setattr(m, "devices", asked(amount=1.5)),

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from copy import deepcopy
 from typing import Any, Final
 
-from rosrm.core.master import lifecycle
+from rosrm.core.master import lifecycle, start_order
 from rosrm.core.master.answers import order_answered
 from rosrm.core.master.applications import restart_policies, rollout
 from rosrm.core.master.applications.difference import changed_fields
@@ -111,6 +111,7 @@ def _settle(state: MasterState, now: float) -> None:
     """Place processes and advance migrations, while hosts carry out every order at once."""
     while True:
         executor.advance_all(state, now)
+        start_order.review(state, now)
         place_waiting(state, now)
         effects = [_carried_out(state, command, now) for command in state.take()]
         if not any(effects):

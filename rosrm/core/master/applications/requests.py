@@ -18,6 +18,7 @@ from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
 from rosrm.core.master.requests import count, submission_fault
 from rosrm.core.master.rights import check_rights
+from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.applications import Application, Version
 from rosrm.model.applications import Action, PlannedAction, Target
 from rosrm.model.event_kinds import EventKind
@@ -192,9 +193,22 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
         if difference.action is Action.START
     ]
     fault = submission_fault(state, changed, len(started)) or neighbour_fault(state, specs)
+    fault = fault or _start_order_fault(state, prepared)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
     check_quota(state, started, by)
+
+
+def _start_order_fault(state: MasterState, prepared: Iterable[Prepared]) -> str:
+    """Return why a desired process could never start; "": each one may."""
+    versions = [one.version for one in prepared if one.version is not None]
+    desired = [spec for version in versions for spec in version.specs.values()]
+    found = [item for one in prepared for item in one.found.items()]
+    stopped = {name for name, difference in found if difference.action is Action.STOP}
+    for spec in desired:
+        for name in stopped.intersection(spec.start_order.after):
+            return f"{spec.name}: after: {name} is no longer a process of its application"
+    return start_order_fault(state, desired)
 
 
 # --- changes ----------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from typing import Final
 from rosrm.core.master.applications.difference import differences, with_changes_in_place
 from rosrm.core.master.applications.replacement import NeverFits, try_replace
 from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.dependants import dependants_first
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import add_process, cancel_process
 from rosrm.core.master.schedules import await_first_run
@@ -87,7 +88,7 @@ def _stop(state: MasterState, application: Application, name: str, now: float) -
         return True
     if not process.phase.is_terminal and process.wanted is not DesiredState.CANCEL:
         cancel_process(state, process, now, Requester(application.principal))
-    return process.phase.is_terminal and state.is_gone(process)
+    return process.phase.is_terminal and not state.may_run(process)
 
 
 def _advance(
@@ -118,7 +119,7 @@ def _advance_ended(
     spec: ProcessSpec, now: float,
 ) -> bool:  # fmt: skip
     """Start a process that does not run; if this was done before, judge its end."""
-    if process is not None and not state.is_gone(process):
+    if process is not None and state.may_run(process):
         task.reason = "waits until its former instance has ended"
         return False
     if process is not None and task.begun and process.spec == spec:
@@ -242,8 +243,10 @@ def _set_wanted(
     application.wanted, application.former, application.paused = number, former, ""
     names = state.names_of(application.name)
     found = differences(state, application.name, application.specs, names)
+    ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]
+    order = dict.fromkeys([one.name for one in dependants_first(state, ending)]) | found
     application.tasks = {
-        name: Task(replaces=one.action is Action.REPLACE) for name, one in found.items()
+        name: Task(replaces=found[name].action is Action.REPLACE) for name in order
     }
     state.save_application(application)
     _review(state, application, now)

@@ -19,6 +19,7 @@ from rosrm.core.master.assignment.neighbours import (
 )
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign
+from rosrm.core.master.dependants import note_restart
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_gap import why_no_work
@@ -188,8 +189,10 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 def place_waiting(state: MasterState, now: float) -> None:
     """Assign queued processes until the head fits nowhere (`backfill`: until no process fits)."""
     state.admit_from_arrays()
+    if not len(state.queue) or state.placed_at == _versions(state):
+        return
     head = state.queue.head()
-    if head is None or state.placed_at == _versions(state):
+    if head is None:
         return
     why = why_no_work(state, now)
     if why:
@@ -199,12 +202,13 @@ def place_waiting(state: MasterState, now: float) -> None:
     if why:
         state.processes[head].reason = state.processes[head].reason or why
         return
-    passed_over = _passed_over(state, now)
+    timed = _passed_over(state, now)
+    passed_over = timed | state.queue.awaiting
     if state.neighbours.declared:
         _place_with_neighbours(state, passed_over, now)
     else:
         _place(state, passed_over, now)
-    if not passed_over:
+    if not timed:  # the others wait for an event
         state.placed_at = _versions(state)
 
 
@@ -258,6 +262,8 @@ def _delayed(state: MasterState, now: float) -> frozenset[str]:
         if now >= process.placed_from:
             state.queue.delayed.remove(name)
             continue
+        if name in state.queue.awaiting:
+            continue  # its reason names what it awaits
         why = f"it is placed on another host after {process.queue_delay:g} s"
         _record_wait_reason(state, process, why, now)
     return frozenset(state.queue.delayed)
@@ -267,7 +273,7 @@ def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a neighbour and do not block those behind them."""
     found = []
     for name in state.neighbours.declared:
-        if name in state.queue:
+        if name in state.queue and name not in state.queue.awaiting:
             why = awaited_neighbour(state, state.processes[name])
             if why:
                 _record_wait_reason(state, state.processes[name], why, now)
@@ -364,6 +370,7 @@ def _assign(
         facts={"number": instance.number, "decision": process.decision, "devices": devices},
     )  # fmt: skip
     state.save(process)
+    note_restart(state, process)
     state.emit(Assign(host.host_id, state.assignment(instance, process.spec)))
 
 

@@ -1,8 +1,8 @@
 """Neighbour rules of a process with the current hosts of the other processes.
 
 A rule "near" without a label ties processes to one host: they are placed, and move, together. A
-process waits until each process near which it must run has a host. If some wait for each other, the
-first of them in the queue does not wait.
+process waits until each process near which it must run has a host. If some wait for each other, by
+these rules or by their start orders, the first of them in the queue that may start does not wait.
 """
 
 from __future__ import annotations
@@ -117,16 +117,16 @@ def _goes_first(state: MasterState, process: Process, name: str) -> bool:
     if process.name not in waiting:
         return False
     in_circle = [one for one in waiting if process.name in _awaited_by(state, one)]
-    first = min((state.processes[one] for one in in_circle), key=_place_in_line)
-    return first is process
+    first = min(in_circle, key=lambda one: _place_in_line(state, state.processes[one]))
+    return first == process.name
 
 
-def _place_in_line(process: Process) -> tuple[int, int]:
-    return -process.spec.priority, process.order
+def _place_in_line(state: MasterState, process: Process) -> tuple[bool, int, int]:
+    return process.name in state.queue.awaiting, -process.spec.priority, process.order
 
 
 def _awaited_by(state: MasterState, name: str) -> dict[str, None]:
-    """Return the process and all without a host for which it waits, by its rules or by theirs."""
+    """Return the process and all without a host for which it waits, itself or through others."""
     found: dict[str, None] = {}
     open_names = [name]
     while open_names:
@@ -137,6 +137,8 @@ def _awaited_by(state: MasterState, name: str) -> dict[str, None]:
         for rule in state.neighbours.declared.get(one, ()):
             if rule.requires_near:
                 open_names += rule.processes
+        if one in state.start_orders.declared:
+            open_names += state.start_orders.declared[one].after
     return found
 
 

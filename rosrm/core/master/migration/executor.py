@@ -345,7 +345,7 @@ def _settle_owner(state: MasterState, process: Process, migration: Migration, no
         lifecycle.conclude(state, process, _end_of_owner(process, migration), host, now)
         return
     if process.wanted is not DesiredState.RUN and not owner.stopping:
-        lifecycle.stop_instance(state, owner, now)
+        lifecycle.stop_owner(state, process, owner, now)
     lifecycle.note_phase(state, process, owner, now)
     state.save(process)
 

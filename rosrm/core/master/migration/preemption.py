@@ -154,7 +154,9 @@ def _waiting(state: MasterState, now: float) -> Iterator[Process]:
         process = state.processes[name]
         if process.spec.priority <= lowest or found == _MOST_WAITING:
             return
-        if name in state.queue.delayed or awaited_neighbour(state, process):
+        if name in state.queue.delayed or name in state.queue.awaiting:
+            continue
+        if awaited_neighbour(state, process):
             continue
         if now - process.since >= state.settings.hysteresis:
             yield process

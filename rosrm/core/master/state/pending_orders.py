@@ -72,6 +72,14 @@ class RestartPolicyChange:
     restart: RestartPolicy
 
 
+@dataclass(frozen=True, slots=True)
+class DependencyRestart:
+    """The order restarts the instance of a process, because a dependency was restarted."""
+
+    process: str
+    number: int
+
+
 Purpose = (
     MigrationStep
     | RestartPolicyChange
@@ -81,6 +89,7 @@ Purpose = (
     | PeriodicCheckpoint
     | LinkMeasurement
     | Reload
+    | DependencyRestart
 )
 
 #: Purposes with their own series of numbers, because they depend on optional plugins or are

@@ -175,7 +175,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on", "next_run",
+    "failed_on", "next_run", "restart_due",
 )  # fmt: skip
 
 
@@ -217,6 +217,8 @@ class Process:
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
         next_run: unix time of the next run of its schedule; 0: none.
+        restart_due: True: a dependency was restarted, and the process must be restarted in place as
+            soon as the conditions of its start order hold.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
@@ -255,6 +257,7 @@ class Process:
     reschedules: int = 0
     queue_delay: float = 0.0
     next_run: float = 0.0
+    restart_due: bool = False
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()
     next_spec: ProcessSpec | None = None

@@ -17,12 +17,14 @@ class Queue:
         version: counter of changes.
         delayed: names in it that wait for the end of their delay.
         arrays: jobs that wait outside of it, because their array has no place for them.
+        awaiting: names in it that wait for other processes to start or finish.
     """
 
     def __init__(self) -> None:
         self.version = 0
         self.delayed: set[str] = set()
         self.arrays = ArrayPlaces()
+        self.awaiting: set[str] = set()
         self._keys: list[_Key] = []
         self._of: dict[str, _Key] = {}
 
@@ -39,8 +41,15 @@ class Queue:
         """Remove a process from any place."""
         key = self._of.pop(name)
         self.delayed.discard(name)
+        self.awaiting.discard(name)
         del self._keys[bisect_left(self._keys, key)]
         self.version += 1
+
+    def set_awaiting(self, name: str, *, awaiting: bool) -> None:
+        """Note whether a process in the queue waits for other processes to start or finish."""
+        if awaiting != (name in self.awaiting):
+            self.awaiting.symmetric_difference_update({name})
+            self.version += 1
 
     def __contains__(self, name: str) -> bool:
         return name in self._of
@@ -52,7 +61,9 @@ class Queue:
         return (name for _, _, name in list(self._keys))
 
     def head(self) -> str | None:
-        """Return the process that is placed next; None: the queue is empty."""
+        """Return the process that is placed next; None: none waits only for its placement."""
+        if self.awaiting:
+            return next((name for _, _, name in self._keys if name not in self.awaiting), None)
         return self._keys[0][2] if self._keys else None
 
     def position(self, name: str) -> int:

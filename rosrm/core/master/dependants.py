@@ -1,0 +1,63 @@
+"""Effects of a process on its dependants, the processes that start after it: stops and restarts.
+
+A cancelled process is stopped after its cancelled dependants. This order follows from the specs and
+the desired states alone, so that it also holds after a restart of the master.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from graphlib import TopologicalSorter
+
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.process import DesiredState, Process
+from rosrm.wording import listed
+
+
+def note_restart(state: MasterState, process: Process) -> None:
+    """Let the dependants that follow a restart restart too, once their conditions hold again."""
+    names = state.start_orders.dependants.get(process.name, ())
+    if names:
+        state.save(process)  # a later master must not take this restart for a new one
+    for name in names:
+        dependant = state.processes[name]
+        if dependant.owner and dependant.spec.start_order.on_restart == "restart":
+            dependant.restart_due = True
+            state.start_orders.to_review[name] = None
+            state.save(dependant)
+
+
+def dependants_first(state: MasterState, processes: Sequence[Process]) -> list[Process]:
+    """Return processes in the order of their stops."""
+    named = {process.name: process for process in processes}
+    dependants = state.start_orders.dependants
+    before = {name: [one for one in dependants.get(name, ()) if one in named] for name in named}
+    if not any(before.values()):
+        return list(processes)
+    return [named[name] for name in TopologicalSorter(before).static_order()]
+
+
+def awaited_ends(state: MasterState, process: Process) -> list[str]:
+    """Return the names of the processes that must end before a cancelled process is stopped."""
+    dependants = state.start_orders.dependants.get(process.name)
+    if dependants is None or process.wanted is not DesiredState.CANCEL:
+        return []
+    return [name for name in dependants if state.processes[name].wanted is DesiredState.CANCEL]
+
+
+def waits_for_ends(state: MasterState, process: Process, now: float) -> bool:
+    """Return True if a cancelled process must not be stopped yet; note since when it waits."""
+    orders = state.start_orders
+    if awaited_ends(state, process):
+        orders.last_to_stop.setdefault(process.name, now)
+        return True
+    if orders.last_to_stop.pop(process.name, None) is not None:
+        orders.note_dependant(process.spec.start_order)
+    return False
+
+
+def described_wait(state: MasterState, process: Process) -> str:
+    """Return a phrase on the ends for which a cancelled process waits; "": it waits for none."""
+    names = awaited_ends(state, process)
+    have = "has" if len(names) == 1 else "have"
+    return f"; waits until {listed(names)} {have} ended" if names else ""

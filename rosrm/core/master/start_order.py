@@ -1,0 +1,241 @@
+"""Start order: waiting processes start after their dependencies; stops are in the reverse order.
+
+=============================  ====================================================================
+process                        action, when a dependency or a dependant of it has changed
+=============================  ====================================================================
+in the queue                   may be placed once all conditions hold and the delay is over; until
+                               then it blocks no other process, and its reason names what it awaits
+running, `on_restart`          is restarted in place once all conditions hold again, if a dependency
+                               was started or restarted after it
+cancelled, with dependants     is ordered to stop once its cancelled dependants have ended
+=============================  ====================================================================
+
+The conditions count at each start from the queue, but not at restarts by the policy of the process,
+nor in a migration. Nothing is journaled but specs, phases, desired states and `restart_due`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from math import inf
+from typing import Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master import lifecycle
+from rosrm.core.master.dependants import awaited_ends, waits_for_ends
+from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.pending_orders import DependencyRestart
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.model.dependencies import circle_fault, circle_in
+from rosrm.model.description_checks import other_process_fault
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RestartInstance
+from rosrm.model.values import InstanceState, Kind, ProcessSpec, StartCondition
+from rosrm.wording import listed, no_such, standing
+
+#: Seconds beyond the time-out of the stop of a dependant, after which its end is not awaited.
+_PATIENCE: Final = 30.0
+#: Phases of a dependency that it leaves only by a request, or when its host returns.
+_NEEDS_HELP: Final = (
+    ProcessPhase.SET_ASIDE, ProcessPhase.UNREACHABLE, ProcessPhase.STUCK, ProcessPhase.CHECKPOINTED,
+)  # fmt: skip
+#: Phases in which a process, and states in which its instance, can be restarted in place.
+_RESTARTABLE: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF)
+_STARTED: Final = (InstanceState.RUNNING, InstanceState.READY, InstanceState.BACKOFF)
+_TO_BE: Final[Mapping[StartCondition, str]] = {"ready": "to be ready", "finished": "to finish"}
+
+
+def review(state: MasterState, now: float) -> None:
+    """Review the processes of which a dependency or a dependant has changed."""
+    for name in state.start_orders.take_due(now):
+        process = state.processes.get(name)
+        if process is None:
+            continue
+        if name in state.queue:
+            _review_waiting(state, process, now)
+        elif name in state.start_orders.last_to_stop:
+            _review_stop(state, process, now)
+        elif process.restart_due:
+            _review_restart(state, process, now)
+
+
+# --- conditions -------------------------------------------------------------------------------
+
+
+def _review_waiting(state: MasterState, process: Process, now: float) -> None:
+    """Let a queued process wait for its dependencies, or be placed."""
+    reason, name = _awaited(state, process, now), process.name
+    if reason and process.reason != reason:
+        state.record(now, EventKind.WAITS, f"{name} {reason}", process=name)
+    if reason or name in state.queue.awaiting:
+        process.reason = reason
+    state.queue.set_awaiting(name, awaiting=bool(reason))
+
+
+def _awaited(state: MasterState, process: Process, now: float) -> str:
+    """Return a predicate on what a process awaits before it may start; "": nothing."""
+    order = process.spec.start_order
+    held_since = {name: _holds_since(state, name, what) for name, what in order.after.items()}
+    start = max(held_since.values(), default=-inf) + order.delay
+    state.start_orders.set_delay(process.name, start if start > now else inf)
+    if start <= now:
+        return ""
+    if start < inf:
+        return f"waits for the end of its delay of {order.delay:g} s after {listed(order.after)}"
+    missing = [name for name, since in held_since.items() if since == inf]
+    conditions = listed(f"for {name} {_TO_BE[order.after[name]]}" for name in missing)
+    obstacles = [_obstacle(state, name) for name in missing]
+    return "; ".join([f"waits {conditions}", *filter(None, obstacles)])
+
+
+def _holds_since(state: MasterState, name: str, condition: StartCondition) -> float:
+    """Return the time since when a condition holds; inf: it does not."""
+    process = state.processes.get(name)
+    if process is None:
+        return inf
+    is_job = process.spec.kind is Kind.JOB
+    holds = process.phase is ProcessPhase.FINISHED and (condition == "finished" or is_job)
+    holds = holds or (process.phase is ProcessPhase.RUNNING and condition == "ready")
+    return process.since if holds else inf
+
+
+def _obstacle(state: MasterState, name: str) -> str:
+    """Return why a condition may never hold without help, and what helps; "": it may."""
+    process = state.processes.get(name)
+    if process is None:
+        return f"{name} does not exist: submit it again"
+    if process.wanted is DesiredState.CANCEL and not process.phase.is_terminal:
+        return f"{name} is being cancelled"
+    if process.phase.is_terminal:
+        return f"{name} {standing(process.phase.value)}: `rosrm restart {name}` starts it again"
+    return f"{name} {standing(process.phase.value)}" if process.phase in _NEEDS_HELP else ""
+
+
+# --- restarts ---------------------------------------------------------------------------------
+
+
+def _review_restart(state: MasterState, process: Process, now: float) -> None:
+    """Restart a process in place, unless it does not run or a condition does not hold."""
+    owner = state.instances.get(process.owner)
+    if owner is None or owner.restarting or process.phase not in _RESTARTABLE:
+        return
+    if owner.state not in _STARTED:
+        return  # an order before the start of the instance would prevent the start
+    if process.wanted is not DesiredState.RUN or _awaited(state, process, now):
+        return
+    state.record(
+        now, EventKind.DEPENDENCY_RESTARTED,
+        f"{process.name} is restarted on {owner.host.name}, because a process after which it "
+        f"starts was restarted",
+        process=process.name, host=owner.host.name,
+    )  # fmt: skip
+    owner.restarting = True
+    purpose = DependencyRestart(process.name, owner.id.number)
+    state.send(owner.host, RestartInstance(owner.id), purpose)
+
+
+def note_answer(
+    state: MasterState, purpose: DependencyRestart, event: happened.OrderAnswered
+) -> None:
+    """Note the answer of a slave to an order to restart; without an answer, order it again."""
+    process, owner = state.processes.get(purpose.process), state.instances.get(purpose.number)
+    if process is None or owner is None or process.owner != purpose.number:
+        return
+    if event.outcome is OrderOutcome.TIMEOUT:
+        owner.restarting = False
+        state.start_orders.note_change(process.name)
+    else:  # a slave refuses the order only if the instance has ended
+        process.restart_due = False
+        state.save(process)
+
+
+# --- stops ------------------------------------------------------------------------------------
+
+
+def _review_stop(state: MasterState, process: Process, now: float) -> None:
+    """Stop a cancelled process if its dependants have ended; else begin its time-out again."""
+    orders, owner = state.start_orders, state.instances.get(process.owner)
+    if orders.last_to_stop[process.name] == inf:
+        orders.last_to_stop[process.name] = now
+    if owner is None or process.name in state.migrations:
+        return  # it is stopped when its migration has ended
+    if not waits_for_ends(state, process, now):
+        lifecycle.stop_instance(state, owner, now)
+    lifecycle.note_phase(state, process, owner, now)
+
+
+def review_stops(state: MasterState, now: float) -> None:
+    """Stop each cancelled process whose dependants do not end in time."""
+    orders = state.start_orders
+    for name, since in list(orders.last_to_stop.items()):
+        process = state.processes[name]
+        awaited = awaited_ends(state, process)
+        if not orders.last_to_stop.keys().isdisjoint(awaited):
+            continue  # one of them waits in turn
+        longest = max((state.processes[one].spec.stop.timeout for one in awaited), default=0.0)
+        owner = state.instances.get(process.owner)
+        if owner is None or now - since < longest + _PATIENCE or name in state.migrations:
+            continue
+        del orders.last_to_stop[name]
+        state.record(
+            now, EventKind.DEPENDANTS_LEFT,
+            f"{name} is stopped before {listed(awaited)}, which did not end in time",
+            process=name, host=owner.host.name,
+        )  # fmt: skip
+        lifecycle.stop_instance(state, owner, now)
+        lifecycle.note_phase(state, process, owner, now)
+        orders.note_dependant(process.spec.start_order)
+
+
+# --- checks of submissions --------------------------------------------------------------------
+
+
+def start_order_fault(state: MasterState, starting: Sequence[ProcessSpec]) -> str:
+    """Return why processes with these start orders must not be queued; "": they may.
+
+    Args:
+        state: has the other processes.
+        starting: processes that are submitted together, or ended ones that start again together.
+    """
+    specs = {spec.name: spec for spec in starting if spec.start_order.after}
+    if not specs:
+        return ""
+    known = {spec.name: spec for spec in starting}
+    for spec in specs.values():
+        for name, condition in spec.start_order.after.items():
+            fault = other_process_fault(name, spec.name)
+            fault = fault or _dependency_fault(state, known, name, condition)
+            if fault:
+                return f"{spec.name}: after: {fault}"
+    circle = circle_in(dict(_reachable(state, specs)))
+    return circle_fault(circle) if circle else ""
+
+
+def _dependency_fault(
+    state: MasterState, starting: Mapping[str, ProcessSpec], name: str, condition: StartCondition
+) -> str:
+    """Return why no process can start after this one; "": it can."""
+    process = state.processes.get(name)
+    if process is None and name not in starting:
+        return no_such("process", [name], [*starting, *reversed(state.processes)])
+    spec = starting[name] if process is None or name in starting else process.spec
+    if condition == "finished" and spec.kind is not Kind.JOB:
+        return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
+    if name in starting or process is None or _holds_since(state, name, condition) < inf:
+        return ""
+    ends = process.wanted is DesiredState.CANCEL or process.phase.is_terminal
+    return _obstacle(state, name) if ends else ""
+
+
+def _reachable(
+    state: MasterState, specs: Mapping[str, ProcessSpec]
+) -> Iterator[tuple[str, Sequence[str]]]:
+    """Yield each of the processes, and those after which they start, with its dependencies."""
+    names, seen = list(specs), set[str]()
+    for name in names:  # they become more
+        order = specs[name].start_order if name in specs else state.start_orders.declared.get(name)
+        if name not in seen and order is not None:
+            seen.add(name)
+            yield name, list(order.after)
+            names += order.after
