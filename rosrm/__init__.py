@@ -149,6 +149,7 @@ if TYPE_CHECKING:
     )
     from rosrm.model.values import (
         Accounting,
+        GroupMembership,
         Health,
         HostDescription,
         HostLossPolicy,
@@ -174,7 +175,8 @@ __all__ = [
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
-    "GraphDepartureLauncher", "HandoffPhase", "Health", "HostChecking", "HostDescription",
+    "GraphDepartureLauncher", "GroupMembership", "HandoffPhase", "Health", "HostChecking",
+    "HostDescription",
     "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "LinkView", "Listing",
@@ -218,8 +220,8 @@ _NAMES: Final = {
     "model.ros_settings": "RosSettings",
     "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
-        "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
-        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
+        "Accounting GroupMembership Health HostDescription HostLossPolicy InstanceId "
+        "IsolationPolicy Kind MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
         "ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }

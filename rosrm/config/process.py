@@ -18,6 +18,7 @@ from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.values import (
     EMPTY,
     Enforcement,
+    GroupMembership,
     Health,
     HostLossAction,
     HostLossPolicy,
@@ -216,6 +217,7 @@ class ProcessInFile:
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
     devices: AskedByKind = field(default_factory=lambda: EMPTY)
+    together: Text = ""
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -245,6 +247,7 @@ class ProcessInFile:
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
+            group=GroupMembership(),  # of the file as a whole
             given=(),
         )
 
@@ -370,6 +373,12 @@ def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
             yield Complaint(("talks_to", name), f"talks_to: {fault}")
 
 
+def _about_gang(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = name_fault(spec.together, "gang") if spec.together else ""
+    if fault:
+        yield Complaint(("together",), f"together: {fault}")
+
+
 def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
     fault = limits_fault(spec)
     if fault:
@@ -473,5 +482,6 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_devices, ("devices", "arguments", "parameters")),
     (_about_flows, ("name", "talks_to")),
+    (_about_gang, ("together",)),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

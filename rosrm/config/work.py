@@ -10,6 +10,7 @@ from typing import Any, Final
 from rosrm.config.checking import near, salvaged
 from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
+from rosrm.config.groups import grouped
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
@@ -20,12 +21,12 @@ from rosrm.extensions.registry import Registry
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
-_SECTIONS: Final = ("processes", "defaults")
+_SECTIONS: Final = ("processes", "defaults", "group")
 #: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
 _NOT_IN_CLUSTER_DEFAULTS: Final = (
-    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to",
+    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "together",
 )  # fmt: skip
 
 
@@ -67,8 +68,9 @@ def checked_work(
     ]
     specs = [_process(node, path, plugins, problems) for node in nodes]
     refuse_namesakes(nodes, "process", problems)
+    members = grouped([spec for spec in specs if spec is not None], root, problems)
     problems.raise_any()
-    return tuple(spec for spec in specs if spec is not None)
+    return members
 
 
 def _entries(root: Node, problems: Problems) -> Sequence[Node]:

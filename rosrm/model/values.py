@@ -36,6 +36,8 @@ IsolationAction = Literal["keep", "stop"]
 Accounting = Literal["attributed", "shared", "countable"]
 Relation = Literal["near", "apart"]
 Enforcement = Literal["preferred", "required"]
+#: Ends of a process after which the others of its group are cancelled: none, failures, or all.
+GroupEnd = Literal["never", "on-failure", "always"]
 #: "": the default scheduling of the operating system.
 RealtimePolicy = Literal["", "fifo", "rr"]
 
@@ -247,6 +249,19 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
+class GroupMembership:
+    """Membership of a process in a group, whose processes end together.
+
+    Attributes:
+        name: name of the group among those of one user; "": the process is in no group.
+        ends: ends of this process after which the others of the group are cancelled.
+    """
+
+    name: str = ""
+    ends: GroupEnd = "never"
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the terms of ROS 2 launch.
 
@@ -272,6 +287,8 @@ class ProcessSpec:
         cpus: numbers of the CPUs that it may use; (): all.
         nice: its niceness, -20..19; 0: that of the slave.
         devices: devices that it holds while it runs, each kind once.
+        group: the group whose processes end together.
+        together: name of its gang; all processes of a gang are placed at once; "": none.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -312,6 +329,8 @@ class ProcessSpec:
     realtime: Realtime = Realtime()
     nice: int = 0
     devices: tuple[DeviceNeed, ...] = ()
+    group: GroupMembership = GroupMembership()
+    together: str = ""
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

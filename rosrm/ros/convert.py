@@ -214,6 +214,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _neighbours_fault(message)
         or _devices_fault(message)
         or _flows_fault(message)
+        or _names_fault(message)
     )
 
 
@@ -222,6 +223,15 @@ def _name_fault(message: msg.ProcessSpec) -> str:
     if namespace and not is_namespace(namespace):
         return f"{namespace!r:.250} is not an absolute namespace such as '/robot1'"
     return name_fault(message.name, "process")
+
+
+def _names_fault(message: msg.ProcessSpec) -> str:
+    """Return why the name of its group or gang is refused; "": they are valid, or not given."""
+    for what, name in (("group", message.group.name), ("gang", message.together)):
+        fault = name_fault(name, what) if name else ""
+        if fault:
+            return fault
+    return ""
 
 
 def _size_fault(message: msg.ProcessSpec) -> str:
@@ -285,6 +295,7 @@ def _word_fault(message: msg.ProcessSpec) -> str:
         ("readiness", message.readiness.kind, get_args(values.ReadinessKind)),
         ("host_loss", message.host_loss.then, get_args(values.HostLossAction)),
         ("isolation", message.isolation.then, get_args(values.IsolationAction)),
+        ("group.ends", message.group.ends, get_args(values.GroupEnd)),
     )
     for name, given, allowed in words:
         if given not in allowed:

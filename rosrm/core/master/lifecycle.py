@@ -343,7 +343,7 @@ def cancelled_as(process: Process) -> tuple[ProcessPhase, str]:
     if process.overdue:
         why = f"it ran longer than its time limit of {process.spec.time_limit:g} s"
         return ProcessPhase.FAILED, why
-    return ProcessPhase.CANCELLED, ""
+    return ProcessPhase.CANCELLED, process.cancel_cause
 
 
 def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:

@@ -28,7 +28,14 @@ from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
-from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
+from rosrm.core.master.state.process import (
+    JOURNALED,
+    DesiredState,
+    Instance,
+    Process,
+    ProcessPhase,
+    ends_group,
+)
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
@@ -88,6 +95,8 @@ class MasterState:
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
         terminal: names of the terminal processes, in the order in which they ended.
+        ended_members: principal and name of each group that has to end, because one of its
+            processes has ended in this step, to the first such process.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
             of submission, because a replay must begin them in the same order.
@@ -119,6 +128,7 @@ class MasterState:
         self.queue = Queue()
         self.processes: dict[str, Process] = {}
         self.terminal: dict[str, None] = {}
+        self.ended_members: dict[tuple[str, str], str] = {}
         self.instances: dict[int, Instance] = {}
         self.migrations: dict[str, Migration] = {}
         self.standbys: dict[str, Migration] = {}
@@ -291,6 +301,9 @@ class MasterState:
             process.phase_before_loss = None
         process.phase = phase
         process.since, process.wall = began
+        if ends_group(process):
+            key = process.principal, process.spec.group.name
+            self.ended_members.setdefault(key, process.name)
 
     def add_process(self, process: Process) -> None:
         """Add a process; it replaces a terminal one of the same name."""
@@ -352,7 +365,7 @@ class MasterState:
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place, given by its priority and order of submission."""
         process.owner, process.ended_on = 0, ""
-        process.wanted, process.overdue = DesiredState.RUN, False
+        process.wanted, process.overdue, process.cancel_cause = DesiredState.RUN, False, ""
         process.started_at, process.began = inf, 0.0
         self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)

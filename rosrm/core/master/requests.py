@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.checkpoint import image_requests, images, replication
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
@@ -232,7 +232,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
     terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in processes:
         if not process.phase.is_terminal:
-            _cancel(state, process, now, event.by)
+            cancel(state, process, now, by=event.by)
     state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
 
 
@@ -252,32 +252,6 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
     if terminal:
         phrases.append(f"ended before: {listed(terminal)}")
     return "; ".join(phrases)
-
-
-def _cancel(state: MasterState, process: Process, now: float, by: Requester) -> None:
-    process.wanted, process.overdue = DesiredState.CANCEL, False
-    state.clear_left_behind(process)
-    state.record(
-        now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
-        process=process.name, by=by,
-    )  # fmt: skip
-    if process.phase in WAITING:
-        state.unqueue(process)
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(
-            now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
-        )
-    elif process.image is not None and process.name not in state.migrations:
-        images.cancel(state, process, now)
-    elif process.owner == 0 and process.name not in state.migrations:
-        # Its owner has ended, and former instances are being stopped.
-        if not lifecycle.requeue_if_clear(state, process, now):
-            lifecycle.note_awaited_ends(state, process, now)
-    elif process.name not in state.migrations:  # otherwise the plan is undone first
-        owner = state.instances[process.owner]
-        lifecycle.note_phase(state, process, owner, now)
-        lifecycle.stop_instance(state, owner, now)
-    state.save(process)
 
 
 def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:

@@ -15,7 +15,7 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
+from rosrm.model.values import GroupEnd, InstanceId, InstanceState, ProcessSpec
 
 
 class ProcessPhase(str, Enum):
@@ -42,6 +42,12 @@ class ProcessPhase(str, Enum):
         return self in _TERMINAL
 
 
+#: Phases of a process that has ended without a cancellation, by the member of `GroupEnd`.
+_ENDS_GROUP: Final[Mapping[GroupEnd, tuple[ProcessPhase, ...]]] = {
+    "never": (),
+    "on-failure": (ProcessPhase.FAILED,),
+    "always": (ProcessPhase.FAILED, ProcessPhase.FINISHED),
+}
 _TERMINAL: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
 #: Phases of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
@@ -174,7 +180,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on",
+    "failed_on", "cancel_cause",
 )  # fmt: skip
 
 
@@ -212,6 +218,7 @@ class Process:
         started_at: time at which it first started since it left the queue; inf: not yet.
         began: unix time of `started_at`; 0: not yet.
         overdue: True: its time limit has passed, and it is being stopped.
+        cancel_cause: why it is, or was, cancelled without a request of a client; "": it was not.
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
@@ -249,6 +256,7 @@ class Process:
     started_at: float = inf
     began: float = 0.0
     overdue: bool = False
+    cancel_cause: str = ""
     reschedules: int = 0
     queue_delay: float = 0.0
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
@@ -287,3 +295,8 @@ class Process:
         """
         self.began = began
         self.started_at = now - max(0.0, wall - began) if began else inf
+
+
+def ends_group(process: Process) -> bool:
+    """Return True if a process has ended in a way that ends its group, too."""
+    return process.phase in _ENDS_GROUP[process.spec.group.ends]
