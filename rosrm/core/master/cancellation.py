@@ -27,6 +27,7 @@ def cancel(
     """
     process.wanted, process.overdue, process.cancel_cause = DesiredState.CANCEL, False, cause
     state.clear_left_behind(process)
+    state.gangs.leave(process)
     message = f"a cancellation of {process.name} was requested"
     if cause:
         message = f"{process.name} is cancelled: {cause}"

@@ -255,6 +255,8 @@ def _ended(
         return
     learn_from(state, process.spec, instance, status)
     learn_run_time(state, process.spec, status)
+    if status.run_time > 0.0:
+        state.gangs.leave(process)
     end = _end(process, instance, status, before)
     migration = _note_end(state, instance, end)
     refused = status.state is InstanceState.REFUSED
@@ -422,6 +424,7 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
         state.record(now, _EVENT[phase], message, process=process.name)
     elif process.wanted is DesiredState.REQUEUE:
         state.enqueue(process, now)
+        state.gangs.note_return(process)
     else:
         return False
     state.save(process)

@@ -18,6 +18,7 @@ from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.flows import Flows
+from rosrm.core.master.state.gangs import Gangs
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
@@ -29,6 +30,7 @@ from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import (
+    BEFORE_START,
     JOURNALED,
     DesiredState,
     Instance,
@@ -135,6 +137,7 @@ class MasterState:
         self.wants_standby: dict[str, None] = {}
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
+        self.gangs = Gangs()
         self.neighbours = NeighbourRules()
         self.flows = Flows()
         self.link_queries = LinkQueries()
@@ -301,6 +304,8 @@ class MasterState:
             process.phase_before_loss = None
         process.phase = phase
         process.since, process.wall = began
+        if process.awaits_gang and phase not in BEFORE_START:
+            self.gangs.leave(process)
         if ends_group(process):
             key = process.principal, process.spec.group.name
             self.ended_members.setdefault(key, process.name)
@@ -319,6 +324,8 @@ class MasterState:
                 self.time_limited.setdefault(process.name)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
+            if process.awaits_gang:
+                self.gangs.add(process)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
             self.flows.declare(process.name, process.spec.talks_to)

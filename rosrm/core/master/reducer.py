@@ -49,6 +49,7 @@ from rosrm.core.master import (
 )
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import place_waiting
+from rosrm.core.master.assignment.gangs import recall_gangs
 from rosrm.core.master.cancellation import cancel_groups
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import Command, Reply
@@ -109,6 +110,7 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
         state.emit(Reply(event.request, False, refusal.code, str(refusal)))
     executor.advance_all(state, now)
     cancel_groups(state, now)
+    recall_gangs(state, now)
     place_waiting(state, now)
     cancel_groups(state, now)  # of which a process has failed, because no host can start it
     plugin_failures.note(state, now)

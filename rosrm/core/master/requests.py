@@ -8,6 +8,7 @@ from typing import Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.assignment.gangs import check_gangs
 from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.checkpoint import image_requests, images, replication
 from rosrm.core.master.commands import Reply
@@ -59,12 +60,14 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     fault = _submission_fault(state, filled) or neighbour_fault(state, specs)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
+    check_gangs(state, specs, event.by.name)
     check_quota(state, specs, event.by)
     wall, born, first = state.wall, state.next_instance, state.next_order
     processes = [
         Process(
             spec, order, ProcessPhase.QUEUED, now, event.by.name, wall=wall, born=born,
             owned_from=_owned_from(state, spec.name, event.by), defaulted=defaulted,
+            awaits_gang=bool(spec.together),
         )
         for order, (spec, defaulted) in enumerate(filled, first)
     ]  # fmt: skip
@@ -297,6 +300,7 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         images.drop(state, process)
         replication.drop_former_replicas(state, process)
         _allow_every_host(process)
+        process.awaits_gang = bool(process.spec.together)
         process.order = state.next_order
         state.next_order += 1
         state.enqueue(process, now)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.assignment.assign import demand_of
+from rosrm.core.master.assignment.demands import demand_of
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign, Command
 from rosrm.core.master.state.hosts import HostCondition, HostTable

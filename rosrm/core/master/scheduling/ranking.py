@@ -178,6 +178,14 @@ class Ranking:
         value[found] = were
         return found
 
+    def in_order(self) -> list[int]:
+        """Return all fitting columns, best first: within the best tier by value, then the others."""
+        fitting = np.flatnonzero(self.value < np.inf)
+        keys = [self.value[fitting]] if self._tier is None else [
+            self.value[fitting], self._tier[fitting],
+        ]  # fmt: skip
+        return [int(column) for column in fitting[np.lexsort(keys)]]
+
     def fits(self, column: int) -> bool:
         """Return True if this host may take the process now."""
         return bool(self.value[column] < np.inf)

@@ -18,6 +18,10 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import GroupEnd, InstanceId, InstanceState, ProcessSpec
 
 
+#: Principal and name of a gang.
+GangKey = tuple[str, str]
+
+
 class ProcessPhase(str, Enum):
     """Phase of a process as the master sees it."""
 
@@ -49,6 +53,10 @@ _ENDS_GROUP: Final[Mapping[GroupEnd, tuple[ProcessPhase, ...]]] = {
     "always": (ProcessPhase.FAILED, ProcessPhase.FINISHED),
 }
 _TERMINAL: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
+#: Phases in which a process has not started since it was last queued.
+BEFORE_START: Final = (
+    ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE, ProcessPhase.ASSIGNED, ProcessPhase.STOPPING,
+)  # fmt: skip
 #: Phases of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 
@@ -180,7 +188,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on", "cancel_cause",
+    "failed_on", "cancel_cause", "awaits_gang",
 )  # fmt: skip
 
 
@@ -219,6 +227,8 @@ class Process:
         began: unix time of `started_at`; 0: not yet.
         overdue: True: its time limit has passed, and it is being stopped.
         cancel_cause: why it is, or was, cancelled without a request of a client; "": it was not.
+        awaits_gang: True: it has a gang, and has not started since it was submitted; so it is
+            placed together with the others of which this is true.
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
@@ -257,6 +267,7 @@ class Process:
     began: float = 0.0
     overdue: bool = False
     cancel_cause: str = ""
+    awaits_gang: bool = False
     reschedules: int = 0
     queue_delay: float = 0.0
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
@@ -272,6 +283,11 @@ class Process:
     def name(self) -> str:
         """Return its name."""
         return self.spec.name
+
+    @property
+    def gang(self) -> GangKey | None:
+        """Return the gang together with which it is placed; None: it is placed alone."""
+        return (self.principal, self.spec.together) if self.awaits_gang else None
 
     @property
     def forbidden_hosts(self) -> dict[str, str]:
