@@ -25,7 +25,7 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
                 HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
-                ReschedulePolicy, StartOrder, ArrayMembership, Schedule
+                ReschedulePolicy, StartOrder, GroupMembership, ArrayMembership, Schedule
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device
@@ -151,6 +151,7 @@ if TYPE_CHECKING:
     from rosrm.model.schedules import Schedule
     from rosrm.model.values import (
         Accounting,
+        GroupMembership,
         Health,
         HostDescription,
         HostLossPolicy,
@@ -177,7 +178,8 @@ __all__ = [
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
-    "GraphDepartureLauncher", "HandoffPhase", "Health", "HostChecking", "HostDescription",
+    "GraphDepartureLauncher", "GroupMembership", "HandoffPhase", "Health", "HostChecking",
+    "HostDescription",
     "HostLabelling", "HostLossPolicy",
     "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
     "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "LinkView", "Listing",
@@ -223,9 +225,9 @@ _NAMES: Final = {
     "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.schedules": "Schedule",
     "model.values": (
-        "Accounting Health HostDescription HostLossPolicy InstanceId IsolationPolicy Kind "
-        "MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
-        "ResourceDescription RestartPolicy StandbyPolicy StartOrder StopPolicy"
+        "Accounting GroupMembership Health HostDescription HostLossPolicy InstanceId "
+        "IsolationPolicy Kind MigrationPolicy NeighbourRule ProcessSpec Readiness Reading "
+        "ReschedulePolicy ResourceDescription RestartPolicy StandbyPolicy StartOrder StopPolicy"
     ),
 }
 _MODULES: Final = {

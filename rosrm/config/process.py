@@ -22,7 +22,7 @@ from rosrm.extensions.units import (
     Seconds,
 )
 from rosrm.model.arrays import INDEX_PLACEHOLDER, ArrayMembership
-from rosrm.model.description_checks import is_namespace, other_process_fault
+from rosrm.model.description_checks import is_namespace, name_fault, other_process_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
@@ -31,6 +31,7 @@ from rosrm.model.schedules import SHORTEST, Schedule
 from rosrm.model.values import (
     EMPTY,
     Enforcement,
+    GroupMembership,
     Health,
     HostLossAction,
     HostLossPolicy,
@@ -241,6 +242,7 @@ class ProcessInFile:
     at: tuple[str, ...] = ()
     on: tuple[str, ...] = ()
     after: Annotated[StartOrder, StartOrderInFile()] = field(default_factory=StartOrder)
+    together: Text = ""
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -272,6 +274,7 @@ class ProcessInFile:
             array=self._membership(),
             schedule=_same(Schedule, self),
             start_order=self.after,
+            group=GroupMembership(),  # of the file as a whole
             given=(),
         )
 
@@ -443,6 +446,12 @@ def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
             yield Complaint(("talks_to", name), f"talks_to: {fault}")
 
 
+def _about_gang(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = name_fault(spec.together, "gang") if spec.together else ""
+    if fault:
+        yield Complaint(("together",), f"together: {fault}")
+
+
 def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
     fault = limits_fault(spec)
     if fault:
@@ -550,5 +559,6 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_start_order, ("name", "after")),
     (_about_devices, ("devices", "arguments", "parameters")),
     (_about_flows, ("name", "talks_to")),
+    (_about_gang, ("together",)),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

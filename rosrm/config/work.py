@@ -10,6 +10,7 @@ from typing import Any, Final
 from rosrm.config.checking import described, near, salvaged, validated
 from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
+from rosrm.config.groups import grouped
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
@@ -23,13 +24,13 @@ from rosrm.model.dependencies import circle_fault, circle_in
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
-_SECTIONS: Final = ("app", "rollout", "processes", "defaults")
+_SECTIONS: Final = ("app", "rollout", "processes", "defaults", "group")
 #: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach", "array", "parallel")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
 _NOT_IN_CLUSTER_DEFAULTS: Final = (
-    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "after", "retries",
-    "every", "at", "on",
+    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "after", "together",
+    "retries", "every", "at", "on",
 )  # fmt: skip
 
 
@@ -89,8 +90,9 @@ def checked_work(root: Node, path: str | Path, registry: Registry | None) -> Tar
     specs = [_process(node, path, plugins, problems) for node in nodes]
     _refuse_circle(nodes, specs, problems)
     refuse_namesakes(nodes, "process", problems)
+    members = grouped([spec for spec in specs if spec is not None], root, problems)
     problems.raise_any()
-    parts = tuple(replace(spec, application=application) for spec in specs if spec is not None)
+    parts = tuple(replace(spec, application=application) for spec in members)
     return Target(application, parts, rollout=rollout)
 
 

@@ -55,7 +55,10 @@ class EventKind(str, Enum):
     STOPPING = "stopping", "the process is being stopped"
     FINISHED = "finished", "the process ended with success"
     FAILED = "failed", "the process ended and is not started again"
-    CANCEL_REQUESTED = "cancel_requested", "a client cancels the process"
+    CANCEL_REQUESTED = (
+        "cancel_requested",
+        "a client cancels the process, or its group ends; facts: group, ended",
+    )
     CANCELLED = "cancelled", "the process ended because it was cancelled"
     OVERDUE = "overdue", "the time limit of the job has passed: it is stopped, and has failed"
     RESTART_REQUESTED = "restart_requested", "a client restarts the process"

@@ -40,6 +40,8 @@ Relation = Literal["near", "apart"]
 Enforcement = Literal["preferred", "required"]
 StartCondition = Literal["ready", "finished"]
 DependencyRestartAction = Literal["ignore", "restart"]
+#: Ends of a process after which the others of its group are cancelled: none, failures, or all.
+GroupEnd = Literal["never", "on-failure", "always"]
 #: "": the default scheduling of the operating system.
 RealtimePolicy = Literal["", "fifo", "rr"]
 
@@ -268,6 +270,19 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
+class GroupMembership:
+    """Membership of a process in a group, whose processes end together.
+
+    Attributes:
+        name: name of the group among those of one user; "": the process is in no group.
+        ends: ends of this process after which the others of the group are cancelled.
+    """
+
+    name: str = ""
+    ends: GroupEnd = "never"
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the terms of ROS 2 launch.
 
@@ -297,6 +312,8 @@ class ProcessSpec:
         schedule: times at which a job starts again.
         application: name of the application of which it is a part; "": it is a single process.
         start_order: the processes after which it starts.
+        group: the group whose processes end together.
+        together: name of its gang; all processes of a gang are placed at once; "": none.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -341,6 +358,8 @@ class ProcessSpec:
     schedule: Schedule = NO_SCHEDULE
     application: str = ""
     start_order: StartOrder = StartOrder()
+    group: GroupMembership = GroupMembership()
+    together: str = ""
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

@@ -251,6 +251,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _devices_fault(message)
         or _flows_fault(message)
         or _start_order_fault(message)
+        or _names_fault(message)
     )
 
 
@@ -261,6 +262,15 @@ def _name_fault(message: msg.ProcessSpec) -> str:
     if message.application and (fault := name_fault(message.application, "application")):
         return fault
     return name_fault(message.name, "process")
+
+
+def _names_fault(message: msg.ProcessSpec) -> str:
+    """Return why the name of its group or gang is refused; "": they are valid, or not given."""
+    for what, name in (("group", message.group.name), ("gang", message.together)):
+        fault = name_fault(name, what) if name else ""
+        if fault:
+            return fault
+    return ""
 
 
 def _size_fault(message: msg.ProcessSpec) -> str:
@@ -338,6 +348,7 @@ def _word_fault(message: msg.ProcessSpec) -> str:
             message.start_order.on_restart,
             get_args(values.DependencyRestartAction),
         ),
+        ("group.ends", message.group.ends, get_args(values.GroupEnd)),
     )
     for name, given, allowed in words:
         if given not in allowed:

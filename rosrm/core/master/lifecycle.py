@@ -296,6 +296,8 @@ def _ended(
         return
     learn_from(state, process.spec, instance, status)
     learn_run_time(state, process.spec, status)
+    if status.run_time > 0.0:
+        state.gangs.leave(process)
     end = _end(process, instance, status, before)
     migration = _note_end(state, instance, end)
     refused = status.state is InstanceState.REFUSED
@@ -384,7 +386,7 @@ def cancelled_as(process: Process) -> tuple[ProcessPhase, str]:
     if process.overdue:
         why = f"it ran longer than its time limit of {process.spec.time_limit:g} s"
         return ProcessPhase.FAILED, why
-    return ProcessPhase.CANCELLED, ""
+    return ProcessPhase.CANCELLED, process.cancel_cause
 
 
 def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
@@ -463,6 +465,7 @@ def requeue_if_clear(state: MasterState, process: Process, now: float) -> bool:
         state.record(now, _EVENT[phase], message, process=process.name)
     elif process.wanted is DesiredState.REQUEUE:
         state.enqueue(process, now)
+        state.gangs.note_return(process)
     else:
         return False
     state.save(process)

@@ -240,7 +240,8 @@ def _replicas(state: MasterState, process: Process, now: float) -> list[Mapping[
 
 
 def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
-    position = row.queue_position
+    gang = (state.queue.position(name) for name in state.gangs.of(process))
+    position = min(filter(None, gang), default=0)
     if row.state == "unknown":
         return row.reason
     if process.name in state.neighbours.separated:

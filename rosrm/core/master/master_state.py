@@ -21,6 +21,7 @@ from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.flows import Flows
+from rosrm.core.master.state.gangs import Gangs
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
@@ -32,7 +33,15 @@ from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
-from rosrm.core.master.state.process import JOURNALED, DesiredState, Instance, Process, ProcessPhase
+from rosrm.core.master.state.process import (
+    BEFORE_START,
+    JOURNALED,
+    DesiredState,
+    Instance,
+    Process,
+    ProcessPhase,
+    ends_group,
+)
 from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
@@ -99,6 +108,8 @@ class MasterState:
         terminal: names of the terminal processes, in the order in which they ended.
         unamended: name of each process whose slave does not know its new restart policy yet, to the
             time of the last order.
+        ended_members: principal and name of each group that has to end, because one of its
+            processes has ended in this step, to the first such process.
         standbys: process name to the migration whose destination is its standby.
         wants_standby: names of the processes that ask for a standby and are not terminal, in order
             of submission, because a replay must begin them in the same order.
@@ -131,12 +142,14 @@ class MasterState:
         self.processes: dict[str, Process] = {}
         self.applications: dict[str, Application] = {}
         self.terminal: dict[str, None] = {}
+        self.ended_members: dict[tuple[str, str], str] = {}
         self.instances: dict[int, Instance] = {}
         self.migrations: dict[str, Migration] = {}
         self.standbys: dict[str, Migration] = {}
         self.wants_standby: dict[str, None] = {}
         self.learned = LearnedNeeds()
         self.run_times: dict[str, float] = {}
+        self.gangs = Gangs()
         self.neighbours = NeighbourRules()
         self.start_orders = StartOrders()
         self.flows = Flows()
@@ -159,9 +172,7 @@ class MasterState:
         self.images = Images()
         self.pending_orders = PendingOrders()
         self.periodic = Periodic()
-        self.next_order = 1
-        self.next_instance = 1
-        self.reserved_instances = 1
+        self.next_order = self.next_instance = self.reserved_instances = 1
         self.wall = 0.0
         self.contact_since = inf
         self.held_since = inf
@@ -339,6 +350,11 @@ class MasterState:
             process.phase_before_loss = None
         process.phase = phase
         process.since, process.wall = began
+        if process.awaits_gang and phase not in BEFORE_START:
+            self.gangs.leave(process)
+        if ends_group(process):
+            key = process.principal, process.spec.group.name
+            self.ended_members.setdefault(key, process.name)
 
     def add_process(self, process: Process) -> None:
         """Add a process; it replaces a terminal one of the same name."""
@@ -357,6 +373,8 @@ class MasterState:
                 self.scheduled.setdefault(process.name)
             if process.spec.standby.wanted:
                 self.wants_standby.setdefault(process.name)
+            if process.awaits_gang:
+                self.gangs.add(process)
             if process.spec.neighbours:
                 self.neighbours.add(process.spec)
             if process.spec.start_order.after:
@@ -378,6 +396,9 @@ class MasterState:
             self.unqueue(process)
         process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
         process.demand = None
+        if process.awaits_gang:
+            self.gangs.leave(process)
+            process.awaits_gang = bool(spec.together)
         self.wants_standby.pop(process.name, None)
         self.time_limited.pop(process.name, None)
         self.scheduled.pop(process.name, None)
@@ -435,7 +456,7 @@ class MasterState:
             self.set_spec(process, process.next_spec)
             process.next_spec = None
         process.owner, process.ended_on = 0, ""
-        process.wanted, process.overdue = DesiredState.RUN, False
+        process.wanted, process.overdue, process.cancel_cause = DesiredState.RUN, False, ""
         process.started_at, process.began = inf, 0.0
         process.restart_due = False
         self.flows.note_change(process.name)

@@ -13,8 +13,10 @@ from rosrm.model.values import Kind, ProcessSpec
 IDENTITY: Final = (
     "namespace", "package", "executable", "module", "command", "ros", "kind",
 )  # fmt: skip
-#: Fields of a single submission, which have no default either.
-_OF_SUBMISSION: Final = ("name", "given", "neighbours", "start_order", "application")
+#: Fields that relate the processes of one file to each other, and so have none, either.
+_OF_ONE_FILE: Final = (
+    "name", "given", "neighbours", "start_order", "application", "group", "together",
+)  # fmt: skip
 #: Fields that only a ROS node has.
 _OF_NODES: Final = ("parameters", "remappings", "health")
 #: Fields of services only; a job does not restart by default, because it may not be repeatable.
@@ -80,7 +82,7 @@ def _leaves(
 def _applies(path: str, default: Any, spec: ProcessSpec) -> bool:
     """Return True if a field may have a default, and the process is of the right kind for it."""
     first = path.partition(".")[0]
-    if first in IDENTITY or first in _OF_SUBMISSION:
+    if first in IDENTITY or first in _OF_ONE_FILE:
         return False
     if path == "migration.options" and not _is_left_out(
         "migration.strategy", spec.migration.strategy, None, spec

@@ -52,6 +52,8 @@ from rosrm.core.master import (
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import requests as application_requests
 from rosrm.core.master.assignment.assign import place_waiting
+from rosrm.core.master.assignment.gangs import recall_gangs
+from rosrm.core.master.cancellation import cancel_groups
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import Command, Reply
 from rosrm.core.master.hosts import registration
@@ -111,7 +113,10 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
         assert isinstance(event, happened.Request)
         state.emit(Reply(event.request, False, refusal.code, str(refusal)))
     executor.advance_all(state, now)
+    cancel_groups(state, now)
     start_order.review(state, now)
+    recall_gangs(state, now)
     place_waiting(state, now)
+    cancel_groups(state, now)  # of which a process has failed, because no host can start it
     plugin_failures.note(state, now)
     return state.take()

@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.assign import reconsider_set_aside
-from rosrm.core.master.checkpoint import image_requests, images
+from rosrm.core.master.assignment.gangs import check_gangs
+from rosrm.core.master.cancellation import cancel
+from rosrm.core.master.checkpoint import image_requests
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
 from rosrm.core.master.dependants import dependants_first
@@ -65,6 +66,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     fault = fault or start_order_fault(state, specs)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
+    check_gangs(state, specs, event.by.name)
     check_quota(state, specs, event.by)
     processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
     nodes, names = {one.node for one in processes}, {one.name for one in processes}
@@ -98,7 +100,7 @@ def add_process(
     process = Process(
         spec, state.next_order, ProcessPhase.QUEUED, now, by.name, wall=state.wall,
         born=state.next_instance, owned_from=_owned_from(state, spec.name, by),
-        defaulted=defaulted,
+        defaulted=defaulted, awaits_gang=bool(spec.together),
     )  # fmt: skip
     state.next_order += 1
     state.add_process(process)
@@ -273,7 +275,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
     terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in dependants_first(state, processes):
         if not process.phase.is_terminal:
-            cancel_process(state, process, now, event.by)
+            cancel(state, process, now, by=event.by)
     state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
 
 
@@ -293,37 +295,6 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
     if terminal:
         phrases.append(f"ended before: {listed(terminal)}")
     return "; ".join(phrases)
-
-
-def cancel_process(state: MasterState, process: Process, now: float, by: Requester) -> None:
-    """Remove a process from the queue, or stop it for good."""
-    process.wanted, process.overdue = DesiredState.CANCEL, False
-    state.clear_left_behind(process)
-    state.record(
-        now, EventKind.CANCEL_REQUESTED, f"a cancellation of {process.name} was requested",
-        process=process.name, by=by,
-    )  # fmt: skip
-    if process.phase in WAITING:
-        state.unqueue(process)
-        state.set_phase(process, ProcessPhase.CANCELLED, now)
-        state.record(
-            now, EventKind.CANCELLED, f"{process.name} cancelled in the queue", process=process.name
-        )
-    elif process.phase is ProcessPhase.SCHEDULED:
-        state.set_phase(process, ProcessPhase.CANCELLED, now, process.reason)
-        message = f"{process.name} cancelled between two runs: its schedule has ended"
-        state.record(now, EventKind.CANCELLED, message, process=process.name)
-    elif process.image is not None and process.name not in state.migrations:
-        images.cancel(state, process, now)
-    elif process.owner == 0 and process.name not in state.migrations:
-        # Its owner has ended, and former instances are being stopped.
-        if not lifecycle.requeue_if_clear(state, process, now):
-            lifecycle.note_awaited_ends(state, process, now)
-    elif process.name not in state.migrations:  # otherwise the plan is undone first
-        owner = state.instances[process.owner]
-        lifecycle.note_phase(state, process, owner, now)
-        lifecycle.stop_owner(state, process, owner, now)
-    state.save(process)
 
 
 def restart_requested(state: MasterState, event: happened.RestartRequested, now: float) -> None:

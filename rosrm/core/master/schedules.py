@@ -81,6 +81,7 @@ def queue_again(state: MasterState, process: Process, now: float) -> None:
     images.drop(state, process)
     replication.drop_former_replicas(state, process)
     allow_every_host(process)
+    process.awaits_gang = bool(process.spec.together)
     process.order = state.next_order
     state.next_order += 1
     state.enqueue(process, now)

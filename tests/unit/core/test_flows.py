@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm import BoolArray, HostView, ProcessView, Scores
-from rosrm.core.master.assignment.assign import demand_of, ranking_of
+from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.scheduling.traffic import flow_view, keeping_limits
 from rosrm.core.master.state.demand import Flow, Traffic

@@ -18,6 +18,7 @@ IN_PLACE: Final = frozenset(
     {
         "restart", "needs", "required_labels", "preferred_labels", "avoided_labels", "priority",
         "migration", "neighbours", "talks_to", "reschedule", "protect", "time_limit",
+        "start_order", "group", "together",
     }
 )  # fmt: skip
 _in_place_of: Final = attrgetter(*sorted(IN_PLACE))

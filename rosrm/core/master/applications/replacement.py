@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.assignment.assign import ranking_of, unable
+from rosrm.core.master.assignment.assign import unable
+from rosrm.core.master.assignment.demands import ranking_of
 from rosrm.core.master.assignment.flows import traffic_of
 from rosrm.core.master.assignment.neighbours import neighbours_of
 from rosrm.core.master.master_state import MasterState

@@ -10,6 +10,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.applications import rollout
 from rosrm.core.master.applications.difference import Difference, differences
 from rosrm.core.master.applications.planning import plan
+from rosrm.core.master.assignment.gangs import check_gangs
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
 from rosrm.core.master.master_state import MasterState
@@ -196,6 +197,7 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
     fault = fault or _start_order_fault(state, prepared)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
+    check_gangs(state, started, by.name)
     check_quota(state, started, by)
 
 

@@ -28,9 +28,10 @@ from typing import Final
 from rosrm.core.master.applications.difference import differences, with_changes_in_place
 from rosrm.core.master.applications.replacement import NeverFits, try_replace
 from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.dependants import dependants_first
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.requests import add_process, cancel_process
+from rosrm.core.master.requests import add_process
 from rosrm.core.master.schedules import await_first_run
 from rosrm.core.master.state.applications import Application, Task
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
@@ -87,7 +88,7 @@ def _stop(state: MasterState, application: Application, name: str, now: float) -
     if process is None or process.spec.application != application.name:
         return True
     if not process.phase.is_terminal and process.wanted is not DesiredState.CANCEL:
-        cancel_process(state, process, now, Requester(application.principal))
+        cancel(state, process, now, by=Requester(application.principal))
     return process.phase.is_terminal and not state.may_run(process)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import reduce
@@ -11,7 +11,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from rosrm.core.master.assignment import gangs
+from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.assignment.flows import joined, traffic_of
+from rosrm.core.master.assignment.gang_search import Blocked, find_places
 from rosrm.core.master.assignment.neighbours import (
     awaited_neighbour,
     neighbours_of,
@@ -43,33 +46,6 @@ _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACH
 _AWAITS_SNAPSHOT: Final = "a host that may have its snapshot has not rejoined yet"
 #: Longest time, in seconds, for which placement waits for a registered host's first request.
 _FIRST_REQUEST: Final = 1.0
-
-
-def demand_of(state: MasterState, process: Process) -> Demand:
-    """Return the demand of a process.
-
-    A change of the learned needs, of the hosts with a replica of its snapshot, of the hosts of its
-    neighbours, or of its flows rebuilds it.
-    """
-    version = state.learned.version
-    near = state.replication.replicas.hosts_of(process.name, process.born)
-    neighbours, traffic = neighbours_of(state, process), traffic_of(state, process)
-    known = process.demand
-    if (
-        known is None
-        or known[0] != version
-        or known[1].near != near
-        or known[1].neighbours != neighbours
-        or known[1].traffic != traffic
-    ):
-        needs = state.estimate(process.spec)
-        demand = Demand(
-            process.spec, needs.amounts, needs.estimated, process.forbidden_hosts, near=near,
-            neighbours=neighbours, traffic=traffic, plugins=state.placement,
-        )  # fmt: skip
-        # Equal processes share one demand, because thousands of them may wait.
-        known = process.demand = (version, state.demands.setdefault(demand.key, demand))
-    return known[1]
 
 
 def demand_to_move(
@@ -162,25 +138,6 @@ def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
     return {name: fault for name, fault in faults.items() if fault}
 
 
-def ranking_of(state: MasterState, demand: Demand) -> Ranking:
-    """Return the current ranking of all hosts for a demand; only assignments update it in place."""
-    if state.rankings_version != state.hosts.version:
-        state.rankings.clear()
-        state.demands.clear()
-        state.rankings_version = state.hosts.version
-    ranking = state.rankings.get(demand.key)
-    if ranking is not None:
-        ranking.refresh()
-    elif demand.key is not demand.key_alone:
-        known = state.rankings.get(demand.key_alone)
-        alone = ranking_of(state, known.demand if known else demand.alone())
-        ranking = state.rankings[demand.key] = alone.beside(demand)
-    else:
-        ranking = Ranking(state.hosts, demand)
-        state.rankings[demand.key] = ranking
-    return ranking
-
-
 def decide_now(state: MasterState, process: Process) -> Decision:
     """Return the decision that placement would make now about a waiting process."""
     return decide(ranking_of(state, demand_of(state, process)))
@@ -213,6 +170,7 @@ def place_waiting(state: MasterState, now: float) -> None:
 
 
 def _place(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    passed_over = _with_gangs(state, passed_over, now)
     if state.settings.backfill:
         _place_any(state, passed_over, now)
     else:
@@ -255,6 +213,16 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     return delayed.union(names)
 
 
+def _with_gangs(state: MasterState, waiting: frozenset[str], now: float) -> frozenset[str]:
+    """Return processes that wait for something else than room, with all of their gangs."""
+    if not state.gangs.members:
+        return waiting
+    others = gangs.incomplete(state, waiting)
+    for name, why in others.items():
+        _record_wait_reason(state, state.processes[name], why, now)
+    return waiting.union(others)
+
+
 def _delayed(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for the end of their delay."""
     for name in list(state.queue.delayed):
@@ -289,8 +257,8 @@ def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float)
 
 def _in_line(state: MasterState, passed_over: frozenset[str]) -> Iterator[str]:
     """Yield the waiting processes in order, while each one leaves the queue."""
-    if passed_over:
-        yield from (name for name in state.queue if name not in passed_over)
+    if passed_over:  # of a gang, others than the first have left the queue with it
+        yield from (one for one in state.queue if one not in passed_over and one in state.queue)
     while not passed_over and (name := state.queue.head()) is not None:
         yield name  # faster, because thousands may wait
 
@@ -300,23 +268,29 @@ def _versions(state: MasterState) -> tuple[int, ...]:
 
     While none of them grows, a process that did not fit still does not fit.
     """
-    hosts = state.hosts
-    return (hosts.version, len(hosts.touched), state.queue.version, state.learned.version)
+    hosts, others = state.hosts, (state.queue, state.gangs, state.learned)
+    return (hosts.version, len(hosts.touched), *(one.version for one in others))
 
 
 def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> None:
-    fit_nowhere = set()
+    fit_nowhere = set[Hashable]()
     for name in state.queue:
-        if name in passed_over:
+        if name in passed_over or name not in state.queue:
             continue
         process = state.processes[name]
-        key = demand_of(state, process).key
+        key = process.gang or demand_of(state, process).key
         if key not in fit_nowhere and not _place_or_set_aside(state, process, now):
             fit_nowhere.add(key)
 
 
 def _place_or_set_aside(state: MasterState, process: Process, now: float) -> bool:
-    """Place a process, or set it aside; return False if it keeps waiting and blocks the queue."""
+    """Place a process, or set it aside; return False if it keeps waiting and blocks the queue.
+
+    The others of its gang share its fate.
+    """
+    members = gangs.members_of(state, process)
+    if len(members) > 1:
+        return _place_gang(state, members, now)
     demand = demand_of(state, process)
     ranking = ranking_of(state, demand)
     column = ranking.best()
@@ -332,6 +306,25 @@ def _place_or_set_aside(state: MasterState, process: Process, now: float) -> boo
         return True
     _record_waiting(state, process, demand, now)
     return False
+
+
+def _place_gang(state: MasterState, members: Sequence[Process], now: float) -> bool:
+    """Place all processes of a gang, or none; otherwise as `_place_or_set_aside`."""
+    found = find_places(state, members)
+    if not isinstance(found, Blocked):
+        for process, column in found:
+            ranking = ranking_of(state, demand_of(state, process))
+            _assign(state, process, ranking, decide(ranking, chosen=column), now)
+        return True
+    never = gangs.why_gang_never(state, members, now)
+    if never:
+        why = f"no hosts may take {gangs.size_of(members)}: {never}"
+        for process in members:
+            state.queue.remove(process.name)
+            _wait_aside(state, process, why, now)
+    else:
+        _record_waiting_gang(state, members, found, now)
+    return bool(never)
 
 
 def _decide_jointly(
@@ -383,12 +376,16 @@ def _set_aside(state: MasterState, process: Process, reason: str, now: float) ->
         state.note_decision(process, decide_now(state, process), "set_aside", now)
         state.record(now, EventKind.FAILED, f"{process.name} failed: {why}", process=process.name)
     else:
-        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
-        state.set_aside.add(process.name)
-        state.record(
-            now, EventKind.SET_ASIDE, f"{process.name} is set aside: {process.reason}",
-            process=process.name,
-        )  # fmt: skip
+        _wait_aside(state, process, _why_aside(reason), now)
+    state.save(process)
+
+
+def _wait_aside(state: MasterState, process: Process, why: str, now: float) -> None:
+    state.set_phase(process, ProcessPhase.SET_ASIDE, now, why)
+    state.set_aside.add(process.name)
+    state.record(
+        now, EventKind.SET_ASIDE, f"{process.name} is set aside: {why}", process=process.name
+    )
     state.save(process)
 
 
@@ -396,10 +393,10 @@ def _why_aside(reason: str) -> str:
     return f"no host may take it: {reason}"
 
 
-def _keep_aside(state: MasterState, process: Process, reason: str, now: float) -> None:
+def _keep_aside(state: MasterState, process: Process, why: str, now: float) -> None:
     """Replace the reason of a process that is set aside, if the reason has changed."""
-    if process.reason != _why_aside(reason):
-        state.set_phase(process, ProcessPhase.SET_ASIDE, now, _why_aside(reason))
+    if process.reason != why:
+        state.set_phase(process, ProcessPhase.SET_ASIDE, now, why)
         state.save(process)
 
 
@@ -410,23 +407,39 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
     """
     if not state.set_aside:
         return
-    judged: dict[object, str] = {}
+    judged: dict[object, tuple[str, bool]] = {}
     aside = [state.processes[name] for name in state.set_aside]
     for process in sorted(aside, key=lambda one: one.order):
-        demand = demand_of(state, process)
-        if demand.key not in judged:
-            judged[demand.key] = why_never(state.hosts, demand)
-        if judged[demand.key]:
-            _keep_aside(state, process, judged[demand.key], now)
-        elif a_known_host_may(state.hosts, demand):
-            state.set_aside.discard(process.name)
-            state.enqueue(process, now)
-            state.record(
-                now, EventKind.QUEUED,
-                f"{process.name} returns to the queue: a host may take it now",
-                process=process.name,
-            )  # fmt: skip
-            state.save(process)
+        key = process.gang or demand_of(state, process).key
+        if key not in judged:
+            judged[key] = _judged(state, process, now)
+        never, may_be_placed = judged[key]
+        if never:
+            _keep_aside(state, process, never, now)
+        elif may_be_placed:
+            _return_from_aside(state, process, now)
+
+
+def _judged(state: MasterState, process: Process, now: float) -> tuple[str, bool]:
+    """Return why no hosts may take a process and its gang ("": some may), and if known ones may."""
+    members = gangs.members_of(state, process)
+    if len(members) > 1:
+        never = gangs.why_gang_never(state, members, now)
+        why = never and f"no hosts may take {gangs.size_of(members)}: {never}"
+        return why, gangs.known_hosts_may(state, members)
+    demand = demand_of(state, process)
+    never = why_never(state.hosts, demand)
+    return never and _why_aside(never), a_known_host_may(state.hosts, demand)
+
+
+def _return_from_aside(state: MasterState, process: Process, now: float) -> None:
+    state.set_aside.discard(process.name)
+    state.enqueue(process, now)
+    state.record(
+        now, EventKind.QUEUED, f"{process.name} returns to the queue: a host may take it now",
+        process=process.name,
+    )  # fmt: skip
+    state.save(process)
 
 
 def _record_waiting(state: MasterState, process: Process, demand: Demand, now: float) -> None:
@@ -440,6 +453,21 @@ def _record_waiting(state: MasterState, process: Process, demand: Demand, now: f
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _record_wait_reason(state, process, reason, now, {"decision": process.decision})
+
+
+def _record_waiting_gang(
+    state: MasterState, members: Sequence[Process], blocked: Blocked, now: float
+) -> None:
+    """Record once that a gang at the head of the queue waits, and the reason."""
+    first, one = members[0], blocked.process
+    reason = why_all_away(state.hosts, demand_of(state, one)) or gangs.why_blocked(members, blocked)
+    if not state.hosts.listed():
+        reason = "no host has registered yet"
+    if first.reason != reason:
+        state.note_decision(one, decide_now(state, one), "waits", now)
+        _record_wait_reason(state, first, reason, now, {"decision": one.decision})
+    for process in members:
+        process.reason = reason
 
 
 def _why_waiting(process: Process) -> str:

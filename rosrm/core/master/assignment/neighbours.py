@@ -17,7 +17,7 @@ from rosrm.core.master.scheduling.proximity import same_place
 from rosrm.core.master.state.demand import Neighbour
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process
-from rosrm.model.values import NeighbourRule
+from rosrm.model.values import EMPTY, NeighbourRule
 from rosrm.wording import standing
 
 _NONE: Final = frozenset[str]()
@@ -97,12 +97,19 @@ def host_of(state: MasterState, name: str) -> tuple[Host | None, str]:
     return owner.host, ""
 
 
-def awaited_neighbour(state: MasterState, process: Process) -> str:
-    """Return why a waiting process waits for another one, near which it must run; "": none."""
+def awaited_neighbour(
+    state: MasterState, process: Process, *, besides: AbstractSet[str] | None = None
+) -> str:
+    """Return why a waiting process waits for another one, near which it must run; "": none.
+
+    `besides`: names of processes for which it does not wait; None: those of its gang.
+    """
+    if besides is None:
+        besides = state.gangs.members.get(process.gang, EMPTY).keys()
     for rule in process.spec.neighbours:
         for name in rule.processes if rule.requires_near else ():
             host, why = host_of(state, name)
-            if host is None and not _goes_first(state, process, name):
+            if host is None and name not in besides and not _goes_first(state, process, name):
                 return _awaited(name, why)
     return ""
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from typing import Final
 
-from rosrm.core.master.assignment.assign import demand_to_restore, ranking_of
+from rosrm.core.master.assignment.assign import demand_to_restore
+from rosrm.core.master.assignment.demands import ranking_of
 from rosrm.core.master.checkpoint import images
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState

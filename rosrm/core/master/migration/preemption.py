@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.assignment.assign import demand_of, ranking_of
+from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.assignment.neighbours import awaited_neighbour, running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
@@ -150,8 +150,11 @@ def _waiting(state: MasterState, now: float) -> Iterator[Process]:
     owners = (state.owned_by(one) for one in state.instances.values())
     lowest = min((one.spec.priority for one in owners if one is not None), default=inf)
     found = 0
+    first: Process | None = None
     for name in state.queue:
         process = state.processes[name]
+        if first is not None and (process.gang is None or process.gang != first.gang):
+            return  # without backfill: after the first process with its gang
         if process.spec.priority <= lowest or found == _MOST_WAITING:
             return
         if name in state.queue.delayed or name in state.queue.awaiting:
@@ -162,7 +165,7 @@ def _waiting(state: MasterState, now: float) -> Iterator[Process]:
             yield process
         found += 1
         if not state.settings.backfill:
-            return
+            first = first or process
 
 
 def _review(

@@ -12,8 +12,8 @@ from rosrm.core.master.assignment.assign import demand_amounts, measured_need
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves
 from rosrm.core.master.migration.start import why_cooling_down, why_immovable
-from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
+from rosrm.core.master.state.hosts import SavedColumn
 from rosrm.core.master.state.process import Instance, Process
 from rosrm.model.plan import Aim
 from rosrm.model.values import InstanceId
@@ -78,13 +78,13 @@ def trial(state: MasterState) -> Iterator[Callable[[PlannedMoves], None]]:
     The devices of the moves are a part of their room.
     """
     table = state.hosts
-    before: dict[int, tuple[FloatArray, int, Inventory]] = {}
+    before: dict[int, SavedColumn] = {}
 
     def reserve(planned: PlannedMoves) -> None:
         host = planned.destination
         column = host.column
-        cells, devices = table.cells[:, :, column].copy(), table.devices[column]
-        before.setdefault(column, (cells, int(table.processes[column]), devices))
+        if column not in before:
+            before[column] = table.saved(host)
         for process, _, own, _ in planned.steps:
             held = table.devices[column].choose(own.demand.spec.devices)
             table.hold(host, InstanceId(process.name, 0), held or ())
@@ -93,8 +93,5 @@ def trial(state: MasterState) -> Iterator[Callable[[PlannedMoves], None]]:
     try:
         yield reserve
     finally:
-        for column, (cells, processes, devices) in before.items():
-            table.devices[column] = devices
-            table.cells[:, :, column] = cells
-            table.processes[column] = processes
-            table.touched.append(column)
+        for saved in before.values():
+            table.restore(saved)

@@ -20,7 +20,7 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.assignment.assign import demand_of, ranking_of
+from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import executor, failover, handoff
 from rosrm.core.master.migration.start import plan_move, why_no_executor

@@ -39,7 +39,7 @@ def why_never(table: HostTable, demand: Demand) -> str:
     An absent host does not count while another host is present, because a process that waits for an
     absent host must not block the queue.
     """
-    if not len(table) or _possible(table, demand).any():
+    if not len(table) or possible(table, demand).any():
         return ""
     unknown = _unmeasured(table, demand) or _unknown_device(table, demand)
     if unknown:
@@ -50,7 +50,7 @@ def why_never(table: HostTable, demand: Demand) -> str:
 
 def a_known_host_may(table: HostTable, demand: Demand) -> bool:
     """Return True if a host whose limits are known may take a demand."""
-    return bool((_possible(table, demand) & ~table.without_reading()).any())
+    return bool((possible(table, demand) & ~table.without_reading()).any())
 
 
 def refused_everywhere(table: HostTable, demand: Demand) -> bool:
@@ -100,7 +100,7 @@ def _fit_empty(hosts: Candidates) -> BoolArray:
     return np.where(table.without_reading(), is_listed, passing(_PERMANENT, hosts))
 
 
-def _possible(table: HostTable, demand: Demand) -> BoolArray:
+def possible(table: HostTable, demand: Demand) -> BoolArray:
     """Return a mask, (H,), of the hosts that may take a demand before a lasting change."""
     hosts = _every(table, demand)
     possible = _fit_empty(hosts) & passing([EXCLUSION, NEIGHBOURS, LINKS], hosts)

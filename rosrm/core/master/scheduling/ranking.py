@@ -178,6 +178,13 @@ class Ranking:
         value[found] = were
         return found
 
+    def in_order(self) -> list[int]:
+        """Return all fitting columns, best first: by the tier of labels, then by value."""
+        fitting = np.flatnonzero(self.value < np.inf)
+        tiers = () if self._tier is None else (self._tier[fitting],)
+        order = np.lexsort((self.value[fitting], *tiers))  # the last key comes first
+        return [int(column) for column in fitting[order]]
+
     def fits(self, column: int) -> bool:
         """Return True if this host may take the process now."""
         return bool(self.value[column] < np.inf)

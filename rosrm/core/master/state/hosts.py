@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
-from rosrm.core.master.state.devices import DeviceTable
+from rosrm.core.master.state.devices import DeviceTable, Inventory
 from rosrm.core.master.state.host_arrays import (
     BUSY,
     LOAD,
@@ -120,6 +120,15 @@ class Host:
         return own.unenforced.keys().isdisjoint(settings) and not (
             own.cpus and set(cpus).difference(own.cpus)
         )
+
+
+class SavedColumn(NamedTuple):
+    """Values that reservations on one host change."""
+
+    column: int
+    cells: FloatArray
+    processes: int
+    devices: Inventory
 
 
 class HostTable(HostColumns):
@@ -321,6 +330,19 @@ class HostTable(HostColumns):
         before = self.devices[host.column]
         if before.held.get(instance, ()) != held:
             self.devices[host.column] = before.with_held(instance, held)
+
+    def saved(self, host: Host) -> SavedColumn:
+        """Return what reservations on a host change, for `restore`."""
+        column = host.column
+        cells, processes = self.cells[:, :, column].copy(), int(self.processes[column])
+        return SavedColumn(column, cells, processes, self.devices[column])
+
+    def restore(self, saved: SavedColumn) -> None:
+        """Undo all reservations on a host since it was saved, without any rounding."""
+        self.devices[saved.column] = saved.devices
+        self.cells[:, :, saved.column] = saved.cells
+        self.processes[saved.column] = saved.processes
+        self.touched.append(saved.column)
 
     def touch(self, host: Host) -> None:
         """Note that something else than the reservations of one host has changed."""

@@ -15,7 +15,10 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.values import InstanceId, InstanceState, ProcessSpec
+from rosrm.model.values import GroupEnd, InstanceId, InstanceState, ProcessSpec
+
+#: Principal and name of a gang.
+GangKey = tuple[str, str]
 
 
 class ProcessPhase(str, Enum):
@@ -43,7 +46,17 @@ class ProcessPhase(str, Enum):
         return self in _TERMINAL
 
 
+#: Phases of a process that has ended without a cancellation, by the member of `GroupEnd`.
+_ENDS_GROUP: Final[Mapping[GroupEnd, tuple[ProcessPhase, ...]]] = {
+    "never": (),
+    "on-failure": (ProcessPhase.FAILED,),
+    "always": (ProcessPhase.FAILED, ProcessPhase.FINISHED),
+}
 _TERMINAL: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED, ProcessPhase.CANCELLED})
+#: Phases in which a process has not started since it was last queued.
+BEFORE_START: Final = (
+    ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE, ProcessPhase.ASSIGNED, ProcessPhase.STOPPING,
+)  # fmt: skip
 #: Phases of processes that wait for a host.
 WAITING: Final = (ProcessPhase.QUEUED, ProcessPhase.SET_ASIDE)
 
@@ -175,7 +188,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on", "next_run", "restart_due",
+    "failed_on", "next_run", "restart_due", "cancel_cause", "awaits_gang",
 )  # fmt: skip
 
 
@@ -214,6 +227,9 @@ class Process:
         started_at: time at which it first started since it left the queue; inf: not yet.
         began: unix time of `started_at`; 0: not yet.
         overdue: True: its time limit has passed, and it is being stopped.
+        cancel_cause: why it is, or was, cancelled without a request of a client; "": it was not.
+        awaits_gang: True: it has a gang, and has not started since it was submitted; so it is
+            placed together with the others of which this is true.
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
         next_run: unix time of the next run of its schedule; 0: none.
@@ -254,6 +270,8 @@ class Process:
     started_at: float = inf
     began: float = 0.0
     overdue: bool = False
+    cancel_cause: str = ""
+    awaits_gang: bool = False
     reschedules: int = 0
     queue_delay: float = 0.0
     next_run: float = 0.0
@@ -279,6 +297,11 @@ class Process:
         return self.phase.is_terminal or self.phase is ProcessPhase.SCHEDULED
 
     @property
+    def gang(self) -> GangKey | None:
+        """Return the gang together with which it is placed; None: it is placed alone."""
+        return (self.principal, self.spec.together) if self.awaits_gang else None
+
+    @property
     def forbidden_hosts(self) -> dict[str, str]:
         """Return host name to the reason why the process must not run there."""
         failed = {
@@ -300,3 +323,8 @@ class Process:
         """
         self.began = began
         self.started_at = now - max(0.0, wall - began) if began else inf
+
+
+def ends_group(process: Process) -> bool:
+    """Return True if a process has ended in a way that ends its group, too."""
+    return process.phase in _ENDS_GROUP[process.spec.group.ends]

@@ -1,0 +1,169 @@
+"""Gangs: processes of one submission that are placed in one decision, or wait together.
+
+============================  ==================================================================
+event                         effect on the gang
+============================  ==================================================================
+submission, restart           the process awaits its gang: it is placed with the others that do
+assignment                    all processes of the gang are assigned in the same step
+start, or its host is lost    the process leaves the gang, and is placed alone from now on
+return to the queue           before its start: the assigned processes of the gang that have not
+                              started either are stopped, and wait with it again
+cancellation                  the process leaves the gang, and the others do not wait for it
+============================  ==================================================================
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from math import inf
+from typing import Final
+
+from rosrm.core.master import lifecycle
+from rosrm.core.master.assignment.demands import demand_of
+from rosrm.core.master.assignment.gang_search import MOST_MEMBERS, Blocked, find_places_if_empty
+from rosrm.core.master.assignment.neighbours import neighbours_of
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.outcomes import RequestRefused
+from rosrm.core.master.scheduling.feasibility import a_known_host_may, why_never
+from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.values import ProcessSpec
+from rosrm.wording import listed, standing
+
+#: Seconds for which the answer of a search stands, because a gang may wait for long.
+_JUDGED_FOR: Final = 1.0
+
+
+def check_gangs(state: MasterState, specs: Sequence[ProcessSpec], principal: str) -> None:
+    """Refuse a submission whose gang is too large, or has the name of one that has not started."""
+    for name in dict.fromkeys(spec.together for spec in specs if spec.together):
+        many = sum(spec.together == name for spec in specs)
+        if many > MOST_MEMBERS:
+            raise RequestRefused(
+                f"the gang {name} has {many} processes; at most {MOST_MEMBERS} start together. "
+                f"Nothing was queued"
+            )
+        waiting = state.gangs.members.get((principal, name))
+        if waiting:
+            raise RequestRefused(
+                f"a gang {name} waits already, and {listed(waiting)} of it "
+                f"{'has' if len(waiting) == 1 else 'have'} not started: cancel it, or choose "
+                f"another name for `together`. Nothing was queued",
+                "name_taken",
+            )
+
+
+def members_of(state: MasterState, process: Process) -> list[Process]:
+    """Return the processes together with which a process is placed, in order of submission."""
+    found = (state.processes[name] for name in state.gangs.of(process))
+    return sorted(found, key=lambda one: (-one.spec.priority, one.order))
+
+
+def size_of(members: Sequence[Process]) -> str:
+    """Return a phrase for all processes of a gang."""
+    return f"all {len(members)} of the gang {members[0].spec.together}"
+
+
+def incomplete(state: MasterState, passed_over: frozenset[str]) -> dict[str, str]:
+    """Return each queued process whose gang cannot be placed yet, with the reason.
+
+    `passed_over`: processes that wait for something else than room.
+    """
+    found: dict[str, str] = {}
+    for names in state.gangs.members.values():
+        absent = [name for name in names if name not in state.queue]
+        held = [name for name in names if name in passed_over]
+        if not absent and not held:
+            continue
+        for name in names:
+            if name in state.queue and name not in passed_over:
+                found[name] = _why_incomplete(state, absent, held)
+    return found
+
+
+def _why_incomplete(state: MasterState, absent: Sequence[str], held: Sequence[str]) -> str:
+    name = (absent or held)[0]
+    other = state.processes[name]
+    gang = f"{name} of its gang {other.spec.together}"
+    if not absent:
+        return f"{gang} waits: {other.reason}"
+    return f"{gang} {standing(other.phase.value)}"
+
+
+def why_gang_never(state: MasterState, members: Sequence[Process], now: float) -> str:
+    """Return why no hosts may take all of a gang before a lasting change; "" if some may."""
+    table = state.hosts
+    for process in members:
+        never = why_never(table, _demand_without_mates(state, process, members))
+        if never:
+            return f"{process.name}: {never}"
+    return _why_never_together(state, members, now) if table.listed() else ""
+
+
+def _why_never_together(state: MasterState, members: Sequence[Process], now: float) -> str:
+    """Return why a gang does not fit even on empty hosts; the answer stands for a second."""
+    names = tuple(process.name for process in members)
+    at, why = state.gangs.judged.get(names, (-inf, ""))
+    if now - at >= _JUDGED_FOR:
+        found = find_places_if_empty(state, members)
+        why = ""
+        if isinstance(found, Blocked) and found.certain:
+            name = found.process.name
+            why = f"{name} fits on no host beside the others, even if nothing else runs"
+        state.gangs.judged[names] = now, why
+    return why
+
+
+def known_hosts_may(state: MasterState, members: Sequence[Process]) -> bool:
+    """Return True if for each process there is a host with known limits that may take it."""
+    return all(
+        a_known_host_may(state.hosts, _demand_without_mates(state, process, members))
+        for process in members
+    )
+
+
+def _demand_without_mates(
+    state: MasterState, process: Process, members: Sequence[Process]
+) -> Demand:
+    """Return the demand of a process without its rules "near" others of its gang."""
+    demand = demand_of(state, process)
+    if not process.spec.neighbours:
+        return demand
+    names = {one.name for one in members}
+    return replace(demand, neighbours=neighbours_of(state, process, together=names))
+
+
+def recall_gangs(state: MasterState, now: float) -> None:
+    """Stop the assigned processes of each gang of which one has returned to the queue."""
+    returned, state.gangs.returned = state.gangs.returned, {}
+    for gang in returned:
+        names = list(state.gangs.members.get(gang, ()))
+        waiting = [name for name in names if name in state.queue]
+        for name in names:
+            process = state.processes[name]
+            if waiting and process.phase is ProcessPhase.ASSIGNED and process.owner:
+                _recall(state, process, waiting[0], now)
+
+
+def _recall(state: MasterState, process: Process, other: str, now: float) -> None:
+    if process.wanted is not DesiredState.RUN or process.name in state.migrations:
+        return
+    owner = state.instances[process.owner]
+    why = f"{other} of its gang {process.spec.together} has returned to the queue"
+    process.wanted = DesiredState.REQUEUE
+    state.set_phase(process, ProcessPhase.STOPPING, now, why)
+    state.record(
+        now, EventKind.STOPPING, f"{process.name} is stopped before its start: {why}",
+        process=process.name, host=owner.host.name,
+    )  # fmt: skip
+    lifecycle.stop_instance(state, owner, now)
+    state.save(process)
+
+
+def why_blocked(members: Sequence[Process], blocked: Blocked) -> str:
+    """Return why a gang waits for room."""
+    beside = " beside the others" if blocked.beside else ""
+    where = f"{blocked.process.name} fits on no host{beside} now"
+    return f"no room for {size_of(members)} at once: {where}"
