@@ -63,6 +63,10 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "namespace": _NAMESPACES,
     "talks_to": st.dictionaries(PROPER_NAMES.map("to-{}".format), st.floats(0.0, 1e15), max_size=3),
     "needs": st.dictionaries(PROPER_NAMES, st.floats(0.0, 1e18), max_size=3),
+    # No variable has a name of this length, because none may be a secret, too.
+    "secrets": st.dictionaries(
+        PROPER_NAMES.map("secret-of-a-{}".format), PRINTABLE.map("/{}".format), max_size=3
+    ),
     "message": PRINTABLE,
     "priority": _INT32,
     "exit_code": _INT32,

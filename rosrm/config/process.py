@@ -15,6 +15,7 @@ from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Qua
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
+from rosrm.model.secret_rules import is_variable, secret_faults
 from rosrm.model.values import (
     EMPTY,
     Enforcement,
@@ -175,6 +176,13 @@ class RealtimeInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class SecretInFile:
+    """Source of a secret on the host that runs the process."""
+
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form."""
 
@@ -216,6 +224,9 @@ class ProcessInFile:
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
     devices: AskedByKind = field(default_factory=lambda: EMPTY)
+    secrets: Annotated[Mapping[str, SecretInFile], NullIsEmpty()] = field(
+        default_factory=lambda: EMPTY
+    )
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -245,6 +256,7 @@ class ProcessInFile:
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
+            secrets={name: secret.file for name, secret in self.secrets.items()},
             given=(),
         )
 
@@ -441,8 +453,13 @@ def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
         text = 'working_directory: "" is no directory; leave it out for one of the process\'s own'
         yield Complaint(("working_directory",), text)
     for name, value in spec.environment.items():
-        if not name or "=" in name or "\0" in name + value:
+        if not is_variable(name, value):
             yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
+
+
+def _about_secrets(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name, fault in secret_faults(spec):
+        yield Complaint(("secrets", name), fault)
 
 
 def _fault_of_parameter(value: Any) -> str:
@@ -466,6 +483,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
     (_about_surroundings, ("working_directory", "environment")),
+    (_about_secrets, ("secrets", "environment")),
     (_about_restarts, ("restart",)),
     (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),

@@ -272,6 +272,8 @@ class ProcessSpec:
         cpus: numbers of the CPUs that it may use; (): all.
         nice: its niceness, -20..19; 0: that of the slave.
         devices: devices that it holds while it runs, each kind once.
+        secrets: variable to the absolute path of a file on its host; each start sets the variable
+            to the content of the file.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -312,6 +314,7 @@ class ProcessSpec:
     realtime: Realtime = Realtime()
     nice: int = 0
     devices: tuple[DeviceNeed, ...] = ()
+    secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:

@@ -50,6 +50,7 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.preferred_labels": 256,
     "ProcessSpec.avoided_labels": 256,
     "ProcessSpec.given": 256,
+    "ProcessSpec.secrets": 256,
     "ProcessSpec.cpus": 1024,
     "HostDescription.unenforced": 16,
     "HostDescription.cpus": 4096,

@@ -30,6 +30,7 @@ from rosrm.model.devices import (
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import limits_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
 from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
@@ -191,7 +192,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         ),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
-    fault = limits_fault(spec)
+    fault = limits_fault(spec) or secrets_fault(spec)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec

@@ -53,13 +53,19 @@ def _chosen(spec: ProcessSpec, defaults: ProcessSpec) -> Iterator[tuple[str, Any
         if not _applies(path, default, spec):
             continue
         if isinstance(own, Mapping):
-            value = {**default, **own}
+            value = {**_without_set(default, path, spec), **own}
         elif path in defaults.given and _is_left_out(path, own, built_in, spec):
             value = default
         else:
             continue
         if value != own:
             yield path, value
+
+
+def _without_set(defaults: Mapping[str, Any], path: str, spec: ProcessSpec) -> Mapping[str, Any]:
+    """Return the defaults of a mapping, without variables that the process sets in another way."""
+    others = {"environment": spec.secrets, "secrets": spec.environment}.get(path, {})
+    return {name: value for name, value in defaults.items() if name not in others}
 
 
 def _leaves(

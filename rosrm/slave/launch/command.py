@@ -68,6 +68,7 @@ def launch_order(
         fence=assignment.fence,
         last_contact=last_contact,
         limits=limit_rule(spec),
+        secrets=spec.secrets,
     )
 
 

@@ -104,6 +104,8 @@ def test_every_key_is_read(file):
         ("command: x, near: []", "neighbours", ()),
         ("command: x, talks_to: {b: 30MB/s, c: 5}", "talks_to", {"b": 30e6, "c": 5.0}),
         ("command: x, talks_to: {memory: 1KiB/s}", "talks_to", {"memory": 1024.0}),
+        ("command: x, secrets: {T: {file: /etc/t}}", "secrets", {"T": "/etc/t"}),
+        ("command: x, secrets:", "secrets", {}),
         (
             "command: x, apart: [b, {processes: [d], by: rack, prefer: true}, 5]",
             "neighbours",
@@ -168,12 +170,20 @@ def test_the_processes_of_one_entry_are_one_group(file):
         ("talks_to: {b: -1MB/s}", "talks_to.b: '-1MB/s' is not within 0..1e+15"),
         ("talks_to: {b: 30MB}", "talks_to.b: unknown unit 'MB'; did you mean 'MB/s'?"),
         ("talks_to: [b]", "talks_to: a mapping is required, not a list"),
+        ("secrets: {T: {file: t}}", "secrets.T: 't' is no absolute path. A host reads the file"),
+        ("secrets: {T: {file: ~/t}}", "secrets.T: '~/t' is no absolute path"),
+        ("secrets: {T: {file: /t}}, environment: {T: x}", "secrets.T: `environment` sets T, too"),
+        ("secrets: {A=B: {file: /t}}", "secrets: 'A=B' cannot be a variable"),
+        ("secrets: {PATH: {file: /t}}", "secrets.PATH: rosrm itself sets or reads PATH"),
+        ("secrets: {ROSRM_HOST: {file: /t}}", "secrets.ROSRM_HOST: rosrm itself sets or reads"),
+        ("secrets: {T: {fiel: /t}}", "unknown key 'fiel' in secrets.T; did you mean 'file'?"),
+        ("secrets: {T: /t}", 'secrets.T: a mapping is required, not "/t"'),
         ("near: [[b]]", "near[0].processes[0]: text is required, not a list"),
         ("spread: {groups: g}", "unknown key 'groups' in spread; did you mean 'group'?"),
         ("near: {processes: [b], prefer: 1}", "near[0].prefer: true or false is required, not 1"),
     ],
 )
-def test_faults_of_neighbours_are_named(file, entry, text):
+def test_faults_of_neighbours_flows_and_secrets_are_named(file, entry, text):
     path = file(
         f"""
         processes:

@@ -204,6 +204,10 @@ def asked(**fields):
     return [msg.DeviceNeed(**{"kind": "gpu", "amount": 1.0, **fields})]
 
 
+def variable(name: str, value: str) -> list[msg.KeyValue]:
+    return [msg.KeyValue(key=name, value=value)]
+
+
 NONSENSE_IN_SPECS = {
     "no name": lambda m: setattr(m, "name", ""),
     "a name with an escape": lambda m: setattr(m, "name", "p\x1b[2J"),
@@ -257,6 +261,12 @@ NONSENSE_IN_SPECS = {
     "a flow that is no number": lambda m: setattr(
         m, "talks_to", [msg.ProcessFlow(process="q", rate=float("nan"))]
     ),
+    "a secret in a relative file": lambda m: setattr(m, "secrets", variable("TOKEN", "token")),
+    "a secret that is also a variable": lambda m: (
+        setattr(m, "secrets", variable("TOKEN", "/t")),
+        setattr(m, "environment", variable("TOKEN", "x")),
+    ),
+    "many secrets": lambda m: setattr(m, "secrets", variable("TOKEN", "/t") * 257),
     "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
     "a device of no kind": lambda m: setattr(m, "devices", asked(kind="")),
