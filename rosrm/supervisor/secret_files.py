@@ -45,9 +45,7 @@ def _read(name: str, path: str) -> str:
     if len(content) > MOST_BYTES:
         raise SpawnError(f"the secret {name} in {path!r} has more than {MOST_BYTES >> 10} KiB")
     if b"\0" in content:
-        raise SpawnError(
-            f"the secret {name} in {path!r} has a NUL byte; none is allowed"
-        )
+        raise SpawnError(f"the secret {name} in {path!r} has a NUL byte; none is allowed")
     return os.fsdecode(content.removesuffix(b"\n"))
 
 
