@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
-from rosrm.model.values import Enforcement, Limits, NeighbourRule, ProcessSpec, Realtime
+from rosrm.model.values import Container, Enforcement, Limits, NeighbourRule, ProcessSpec, Realtime
 
 Drawn = st.SearchStrategy[Any]
 
@@ -67,6 +67,8 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "secrets": st.dictionaries(
         PROPER_NAMES.map("secret-of-a-{}".format), PRINTABLE.map("/{}".format), max_size=3
     ),
+    "container": st.just(Container()) | st.builds(Container, PROPER_NAMES, PROPER_NAMES),
+    "launchers": st.lists(PROPER_NAMES, max_size=3).map(tuple),
     "message": PRINTABLE,
     "priority": _INT32,
     "exit_code": _INT32,

@@ -90,4 +90,5 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "near": _neighbours,
     "apart": _neighbours,
     "spread": _word("by"),
+    "container": _word("image"),
 }

@@ -11,13 +11,16 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
+from rosrm.config.settings import DEFAULT_ENGINE
 from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.secret_rules import is_variable, secret_faults
 from rosrm.model.values import (
     EMPTY,
+    Container,
     Enforcement,
     Health,
     HostLossAction,
@@ -183,6 +186,14 @@ class SecretInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class ContainerInFile:
+    """Container in which a process runs."""
+
+    image: Text
+    engine: Text = DEFAULT_ENGINE
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form."""
 
@@ -227,6 +238,7 @@ class ProcessInFile:
     secrets: Annotated[Mapping[str, SecretInFile], NullIsEmpty()] = field(
         default_factory=lambda: EMPTY
     )
+    container: ContainerInFile | None = None
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -257,6 +269,7 @@ class ProcessInFile:
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
             secrets={name: secret.file for name, secret in self.secrets.items()},
+            container=Container() if self.container is None else _same(Container, self.container),
             given=(),
         )
 
@@ -462,6 +475,12 @@ def _about_secrets(spec: ProcessSpec) -> Iterator[Complaint]:
         yield Complaint(("secrets", name), fault)
 
 
+def _about_container(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = container_fault(spec)
+    if fault:
+        yield Complaint(("container",), fault)
+
+
 def _fault_of_parameter(value: Any) -> str:
     if value is None:
         return "a value is required; ROS has no null"
@@ -484,6 +503,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
     (_about_surroundings, ("working_directory", "environment")),
     (_about_secrets, ("secrets", "environment")),
+    (_about_container, ("container",)),
     (_about_restarts, ("restart",)),
     (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),

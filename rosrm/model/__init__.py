@@ -13,6 +13,7 @@ codec.py                conversion of values to JSON and back
 durations.py            bound of all times
 links.py                measurements of links between hosts
 limits.py               rules for limits and scheduling of a process
+container_rules.py      rules for the container of a process
 secret_rules.py         rules for the secrets of a process
 description_checks.py   checks of the description of a host
 """

@@ -247,6 +247,19 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
+class Container:
+    """Container in which a process runs.
+
+    Attributes:
+        image: image as its engine names it; "": the process runs in no container.
+        engine: launcher that starts the container; "": no image is given.
+    """
+
+    image: str = ""
+    engine: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the terms of ROS 2 launch.
 
@@ -274,6 +287,7 @@ class ProcessSpec:
         devices: devices that it holds while it runs, each kind once.
         secrets: variable to the absolute path of a file on its host; each start sets the variable
             to the content of the file.
+        container: container in which it runs.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -315,6 +329,7 @@ class ProcessSpec:
     nice: int = 0
     devices: tuple[DeviceNeed, ...] = ()
     secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    container: Container = Container()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -334,11 +349,12 @@ class ProcessSpec:
     @property
     def program(self) -> str:
         """Return the program as one text: the key under which its needs are learned."""
+        inside = f" in {self.container.image}" if self.container.image else ""
         if self.package is not None:
-            return f"{self.package}/{self.executable}"
+            return f"{self.package}/{self.executable}{inside}"
         if self.module is not None:
-            return f"python -m {self.module}"
-        return " ".join(self.command)
+            return f"python -m {self.module}{inside}"
+        return " ".join(self.command) + inside
 
 
 def qualified_name(namespace: str, node_name: str) -> str:
@@ -565,6 +581,7 @@ class HostDescription:
             why this host cannot enforce it.
         cpus: numbers of the CPUs that processes may use; (): unknown.
         devices: devices that the host gives to its processes.
+        launchers: names of the launchers that work on this host.
     """
 
     name: str
@@ -581,6 +598,7 @@ class HostDescription:
     unenforced: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     cpus: tuple[int, ...] = ()
     devices: tuple[Device, ...] = ()
+    launchers: tuple[str, ...] = ()
 
     def accounted(self, accounting: Accounting) -> frozenset[str]:
         """Return the names of the resources with this accounting."""

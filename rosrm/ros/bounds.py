@@ -38,6 +38,7 @@ _OTHER_ENTRIES: Final = {
     "HostDescription.labels": 256,
     "HostDescription.resources": 16,
     "HostDescription.executors": 256,
+    "HostDescription.launchers": 256,
     "HostDescription.absent": 256,
     "HostDescription.devices": 256,
     "Assignment.devices": 256,

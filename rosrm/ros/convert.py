@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
+from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import (
     description_fault,
     is_namespace,
@@ -192,7 +193,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         ),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
-    fault = limits_fault(spec) or secrets_fault(spec)
+    fault = limits_fault(spec) or secrets_fault(spec) or container_fault(spec)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec

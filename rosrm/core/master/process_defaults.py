@@ -11,7 +11,7 @@ from rosrm.model.values import Kind, ProcessSpec
 
 #: Fields that identify a process, its program and its kind, and so have no default of the cluster.
 IDENTITY: Final = (
-    "namespace", "package", "executable", "module", "command", "ros", "kind",
+    "namespace", "package", "executable", "module", "command", "ros", "kind", "container",
 )  # fmt: skip
 #: Fields that only a ROS node has.
 _OF_NODES: Final = ("parameters", "remappings", "health")

@@ -59,7 +59,7 @@ def test_mappings_are_merged_and_the_entries_of_the_process_count() -> None:
 
 
 def test_a_process_sets_each_variable_in_one_way() -> None:
-    """A default variable gives way to a secret of the same name, and the other way round."""
+    """A variable or secret of a process replaces defaults of the same name in both mappings."""
     given = defaults("environment", environment={"A": "cluster", "B": "cluster"})
     spec, _ = with_defaults(process("p", secrets={"A": "/own"}), given)
     assert (spec.environment, spec.secrets) == ({"B": "cluster"}, {"A": "/own"})

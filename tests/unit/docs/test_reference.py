@@ -111,7 +111,7 @@ def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
     wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
-    wanted |= {"limits", "realtime"}
+    wanted |= {"limits", "realtime", "container"}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted

@@ -266,6 +266,10 @@ NONSENSE_IN_SPECS = {
         setattr(m, "secrets", variable("TOKEN", "/t")),
         setattr(m, "environment", variable("TOKEN", "x")),
     ),
+    "an engine without an image": lambda m: setattr(m.container, "engine", "podman"),
+    "an option as an image": lambda m: setattr(
+        m, "container", msg.Container(image="-v", engine="x")
+    ),
     "many secrets": lambda m: setattr(m, "secrets", variable("TOKEN", "/t") * 257),
     "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
