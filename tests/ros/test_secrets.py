@@ -47,15 +47,3 @@ def test_the_process_gets_its_secret_and_nobody_else(make_cluster, tmp_path) -> 
     assert not files_with(cluster.directory, SECRET)
     assert not files_with(records, SECRET)
     assert f"`chmod o-rw {token}`" in cluster.log_of("a")
-
-
-def test_a_restart_tries_the_host_again_that_lacked_the_secret(make_cluster, tmp_path) -> None:
-    """Until then the process has failed, as if the host lacked its program."""
-    token = tmp_path / "token"
-    cluster = make_cluster(host("a"), liveness=STEADY)
-    cluster.submit(python("robot", CHECK, secrets={"TOKEN": str(token)}))
-    reason = cluster.wait("robot", "failed").reason
-    assert f"a: the secret TOKEN cannot be read: '{token}': No such file or directory" in reason
-    token.write_bytes(SECRET)
-    cluster.client.restart(["robot"])
-    cluster.wait_for_log("robot", "the secret has arrived")
