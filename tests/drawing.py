@@ -15,6 +15,7 @@ from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
 from rosrm.model.schedules import NO_SCHEDULE, WEEKDAYS, Schedule
 from rosrm.model.values import (
+    Container,
     DependencyRestartAction,
     Enforcement,
     Kind,
@@ -93,6 +94,12 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
         st.floats(0.0, LONGEST), st.sampled_from(get_args(DependencyRestartAction)),
     ),
     "needs": st.dictionaries(PROPER_NAMES, st.floats(0.0, 1e18), max_size=3),
+    # No variable has a name of this length, because none may be a secret, too.
+    "secrets": st.dictionaries(
+        PROPER_NAMES.map("secret-of-a-{}".format), PRINTABLE.map("/{}".format), max_size=3
+    ),
+    "container": st.just(Container()) | st.builds(Container, PROPER_NAMES, PROPER_NAMES),
+    "launchers": st.lists(PROPER_NAMES, max_size=3).map(tuple),
     "message": PRINTABLE,
     "priority": _INT32,
     "exit_code": _INT32,

@@ -116,4 +116,5 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "at": _list,
     "on": _list,
     "after": _after,
+    "container": _word("image"),
 }

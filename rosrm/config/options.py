@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, get_args, get_type_hints
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
 from rosrm.errors import ConfigError
-from rosrm.extensions.declared_fields import no_standby
+from rosrm.extensions.declared_fields import container_conflict, no_standby
 from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import IsResource
@@ -54,6 +54,12 @@ class PluginCheck:
         if self._registry is not None and self._registry.capabilities_of()(spec).shadow:
             return ""
         return no_standby(strategy, known)
+
+    def container_fault(self, spec: ProcessSpec) -> str:
+        """Return why a process in a container cannot move by its strategy; "": it can."""
+        if self._registry is None or spec.migration.strategy is None:
+            return ""
+        return container_conflict(spec, self._registry.capabilities_of()(spec))
 
     def choice(
         self, kind: PluginKind, name: str, named: Node, options: Node | None, *,

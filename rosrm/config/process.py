@@ -11,6 +11,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
+from rosrm.config.settings import DEFAULT_ENGINE
 from rosrm.config.start_order_forms import StartOrderInFile
 from rosrm.extensions.units import (
     Amount,
@@ -22,14 +23,17 @@ from rosrm.extensions.units import (
     Seconds,
 )
 from rosrm.model.arrays import INDEX_PLACEHOLDER, ArrayMembership
+from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import is_namespace, name_fault, other_process_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
 from rosrm.model.schedules import SHORTEST, Schedule
+from rosrm.model.secret_rules import is_variable, secret_faults
 from rosrm.model.values import (
     EMPTY,
+    Container,
     Enforcement,
     GroupMembership,
     Health,
@@ -190,6 +194,21 @@ class RealtimeInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class SecretInFile:
+    """Source of a secret on the host that runs the process."""
+
+    file: str
+
+
+@dataclass(frozen=True, slots=True)
+class ContainerInFile:
+    """Container in which a process runs."""
+
+    image: Text
+    engine: Text = DEFAULT_ENGINE
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form.
 
@@ -243,6 +262,10 @@ class ProcessInFile:
     on: tuple[str, ...] = ()
     after: Annotated[StartOrder, StartOrderInFile()] = field(default_factory=StartOrder)
     together: Text = ""
+    secrets: Annotated[Mapping[str, SecretInFile], NullIsEmpty()] = field(
+        default_factory=lambda: EMPTY
+    )
+    container: ContainerInFile | None = None
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -275,6 +298,8 @@ class ProcessInFile:
             schedule=_same(Schedule, self),
             start_order=self.after,
             group=GroupMembership(),  # of the file as a whole
+            secrets={name: secret.file for name, secret in self.secrets.items()},
+            container=Container() if self.container is None else _same(Container, self.container),
             given=(),
         )
 
@@ -525,8 +550,19 @@ def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
         text = 'working_directory: "" is no directory; leave it out for one of the process\'s own'
         yield Complaint(("working_directory",), text)
     for name, value in spec.environment.items():
-        if not name or "=" in name or "\0" in name + value:
+        if not is_variable(name, value):
             yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
+
+
+def _about_secrets(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name, fault in secret_faults(spec):
+        yield Complaint(("secrets", name), fault)
+
+
+def _about_container(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = container_fault(spec)
+    if fault:
+        yield Complaint(("container",), fault)
 
 
 def _fault_of_parameter(value: Any) -> str:
@@ -550,6 +586,8 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
     (_about_surroundings, ("working_directory", "environment")),
+    (_about_secrets, ("secrets", "environment")),
+    (_about_container, ("container",)),
     (_about_restarts, ("restart",)),
     (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_jobs, ("array", "parallel", "every", "at", "on", "kind")),

@@ -42,6 +42,8 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import EMPTY, ProcessSpec
 from rosrm.wording import weighted
 
+#: Default launcher of containers.
+DEFAULT_ENGINE: Final = "podman"
 #: Default upper limits: memory as in the paper, CPU and disk with a reserve.
 DEFAULT_LIMITS: Final[Mapping[str, float]] = {"memory": 0.8, "cpu": 0.9, "disk": 0.9}
 

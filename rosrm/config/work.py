@@ -208,6 +208,9 @@ def _process(
     fault = plugins.standby_fault(spec) if wrong.isdisjoint(("standby", "migration")) else ""
     if fault:
         problems.add(node.deepest(("standby",)).place, fault)
+    fault = plugins.container_fault(spec) if wrong.isdisjoint(("container", "migration")) else ""
+    if fault:
+        problems.add(node.deepest(("container",)).place, fault)
     return spec
 
 

@@ -19,7 +19,7 @@ from rosrm.wording import listed
 STANDARD_FIELDS: Final = (
     "package", "executable", "module", "command", "namespace", "kind", "priority", "needs",
     "required_labels", "preferred_labels", "avoided_labels", "limits", "cpus", "realtime", "nice",
-    "devices",
+    "devices", "container",
 )  # fmt: skip
 #: Field that gives the policy the flows of the process, also the learned ones.
 FLOWS_FIELD: Final = "talks_to"
@@ -83,6 +83,16 @@ def no_standby(strategy: str | None, known: Mapping[str, Capabilities]) -> str:
     why = f"{strategy} has no standby" if strategy else "no migration strategy is given"
     remedy = f"write {listed(able, 'or')}" if able else "install a strategy with standbys"
     return f"a standby needs a migration strategy that copies state, and {why}: {remedy}"
+
+
+def container_conflict(spec: ProcessSpec, able: Capabilities) -> str:
+    """Return why a process in a container cannot move by a strategy; "": it can, or has none."""
+    if not spec.container.image or (able.state == "none" and not able.launcher):
+        return ""
+    return (
+        f"{spec.migration.strategy} moves the state of a process, which is not possible with a "
+        "container; write a strategy that starts the process again, such as relaunch"
+    )
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,8 @@ arrays.py               the array of a job, and the placeholder of its index
 schedules.py            times at which a job starts again
 job_checks.py           rules for arrays and schedules
 limits.py               rules for limits and scheduling of a process
+container_rules.py      rules for the container of a process
+secret_rules.py         rules for the secrets of a process
 dependencies.py         circles of processes that start after each other
 description_checks.py   checks of the description of a host, and of names
 """

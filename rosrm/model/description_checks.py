@@ -78,7 +78,7 @@ def description_fault(description: HostDescription) -> str:
             f"{_LONGEST_PERIOD:g}"
         )
     words = (description.hostname, description.software_version, *description.executors,
-             *description.absent, *description.unenforced,
+             *description.launchers, *description.absent, *description.unenforced,
              *description.labels, *description.labels.values())  # fmt: skip
     unprintable = next((word for word in words if not word.isprintable()), None)
     if unprintable is not None:

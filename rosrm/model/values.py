@@ -283,6 +283,19 @@ class GroupMembership:
 
 
 @dataclass(frozen=True, slots=True)
+class Container:
+    """Container in which a process runs.
+
+    Attributes:
+        image: image as its engine names it; "": the process runs in no container.
+        engine: launcher that starts the container; "": no image is given.
+    """
+
+    image: str = ""
+    engine: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the terms of ROS 2 launch.
 
@@ -314,6 +327,9 @@ class ProcessSpec:
         start_order: the processes after which it starts.
         group: the group whose processes end together.
         together: name of its gang; all processes of a gang are placed at once; "": none.
+        secrets: variable to the absolute path of a file on its host; each start sets the variable
+            to the content of the file.
+        container: container in which it runs.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -360,6 +376,8 @@ class ProcessSpec:
     start_order: StartOrder = StartOrder()
     group: GroupMembership = GroupMembership()
     together: str = ""
+    secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    container: Container = Container()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -379,11 +397,12 @@ class ProcessSpec:
     @property
     def program(self) -> str:
         """Return the program as one text: the key under which its needs are learned."""
+        inside = f" in {self.container.image}" if self.container.image else ""
         if self.package is not None:
-            return f"{self.package}/{self.executable}"
+            return f"{self.package}/{self.executable}{inside}"
         if self.module is not None:
-            return f"python -m {self.module}"
-        return " ".join(self.command)
+            return f"python -m {self.module}{inside}"
+        return " ".join(self.command) + inside
 
 
 def qualified_name(namespace: str, node_name: str) -> str:
@@ -610,6 +629,7 @@ class HostDescription:
             why this host cannot enforce it.
         cpus: numbers of the CPUs that processes may use; (): unknown.
         devices: devices that the host gives to its processes.
+        launchers: names of the launchers that work on this host.
     """
 
     name: str
@@ -626,6 +646,7 @@ class HostDescription:
     unenforced: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     cpus: tuple[int, ...] = ()
     devices: tuple[Device, ...] = ()
+    launchers: tuple[str, ...] = ()
 
     def accounted(self, accounting: Accounting) -> frozenset[str]:
         """Return the names of the resources with this accounting."""

@@ -14,6 +14,7 @@ from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
 from rosrm.model.applications import OnFailure, RolloutPolicy, Target
+from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import (
     description_fault,
     is_namespace,
@@ -33,6 +34,7 @@ from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
+from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
 from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
@@ -195,7 +197,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         ),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
     )  # fmt: skip
-    fault = limits_fault(spec) or job_fault(spec)
+    fault = limits_fault(spec) or job_fault(spec) or secrets_fault(spec) or container_fault(spec)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec

@@ -136,6 +136,7 @@ class SlaveRuntime:
                 LauncherContext(config.state, sys.executable, self._incarnation)
             )
             launchers = Launchers.of(offered, registry.capabilities_of())
+            self._launchers = tuple(launchers.made)
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
             self._absent = self._open_probes(registry, sessions, opened)
@@ -253,6 +254,7 @@ class SlaveRuntime:
             labels={**self._probe_labels, **config.labels},
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
             period=config.period, executors=self._executors.names, absent=self._absent,
+            launchers=self._launchers,
             unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
             devices=self._devices.devices,
         )  # fmt: skip

@@ -94,6 +94,11 @@ class SupervisorLink:
         """Return limits and scheduling settings to the reasons why they cannot be enforced."""
         return self._client.unenforced
 
+    @property
+    def reads_secrets(self) -> bool:
+        """Return True if the supervisor reads the secrets of instances."""
+        return self._client.reads_secrets
+
     def group_of(self, instance: InstanceId) -> InstanceGroup:
         """Return the control group of an instance."""
         return InstanceGroup(self._client.groups, instance)

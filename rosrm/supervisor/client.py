@@ -76,6 +76,7 @@ class SupervisorClient:
         fenced: instances that have a fence.
         unenforced: limit or scheduling setting to the reason why it cannot be enforced here.
         groups: version, directory and controllers of each tree of the instances' control groups.
+        reads_secrets: it reads the secrets of instances; one of an earlier version does not.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -96,6 +97,7 @@ class SupervisorClient:
         self.fenced: frozenset[InstanceId] = frozenset()
         self.unenforced: Mapping[str, str] = {}
         self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
+        self.reads_secrets = False
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -203,7 +205,7 @@ class SupervisorClient:
         return messages.Launch(
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,
-            fence_rule(order.fence), order.last_contact, order.limits,
+            fence_rule(order.fence), order.last_contact, order.limits, order.secrets,
         )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -292,6 +294,7 @@ class SupervisorClient:
         self.instances = tuple(status_from(value) for value in instances)
         self.fenced = frozenset(InstanceId(*messages.read_key(key)) for key in fenced)
         self.unenforced = messages.read_texts(fields.get("unenforced", _NOTHING_ENFORCED))
+        self.reads_secrets = bool(fields.get("secrets", False))
         groups: Any = fields.get("groups", ())
         self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, StopRule
 from rosrm.model.values import (
+    EMPTY,
     Fence,
     InstanceId,
     InstanceState,
@@ -30,6 +31,7 @@ class LaunchOrder:
         fence: rule by which the supervisor ends the instance without an order; None: never.
         limits: limits and scheduling.
         last_contact: of the master with this host, monotonic; 0.0: now.
+        secrets: variable to the path of a file, which the supervisor reads at each start.
     """
 
     instance: InstanceId
@@ -42,6 +44,7 @@ class LaunchOrder:
     fence: Fence | None = None
     last_contact: float = 0.0
     limits: LimitRule = field(default_factory=LimitRule)
+    secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
 
 
 @dataclass(frozen=True, slots=True)

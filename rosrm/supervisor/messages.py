@@ -9,7 +9,8 @@ The client sends orders; the key `do` names the order:
                  log_bytes                      `LogLimits`; log_bytes: the last one
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
-                 heard, memo, limits
+                 heard, memo, limits,
+                 secrets
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
@@ -17,6 +18,8 @@ The client sends orders; the key `do` names the order:
                                                 `heard`; heard: last contact; 0: now
                                                 memo: a text that is kept for the client
                                                 limits: the fields of `LimitRule`, in their order
+                                                secrets: variable to the path of a file, whose
+                                                content is read at each start and never recorded
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -38,7 +41,7 @@ The client sends orders; the key `do` names the order:
 
 The supervisor sends messages; the key `tell` names the message:
 
-    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups
+    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
@@ -46,6 +49,7 @@ The supervisor sends messages; the key `tell` names the message:
                                                    reason why it cannot be enforced
                                                    groups: [version, directory, controllers] where
                                                    the control groups of instances are
+                                                   secrets: true, for it reads them at each start
     status       status                            a change, or the answer to a repeated order
     amended      instance, restart                 the amendment is recorded; its status came before
     refused      message                           the supervisor closes the connection after it
@@ -59,6 +63,7 @@ The supervisor refuses a line that it cannot decode, and another protocol number
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervisor import events
@@ -109,6 +114,7 @@ class Launch(NamedTuple):
     fence: FenceRule | None = None
     heard: float = 0.0
     limits: LimitRule = LimitRule()
+    secrets: Mapping[str, str] = MappingProxyType({})
 
     def amended(self, amendment: Amend) -> Launch:
         """Return this launch with the restart policy and environment changes of an amendment."""
@@ -212,7 +218,8 @@ _KINDS: Final[Mapping[type, str]] = {
 
 def launch_fields(launch: Launch) -> dict[str, Any]:
     """Return a launch in values that JSON can hold; the record stores the same form."""
-    return {**launch._asdict(), "changes": dict(launch.changes)}
+    mappings = {"changes": dict(launch.changes), "secrets": dict(launch.secrets)}
+    return {**launch._asdict(), **mappings}
 
 
 def decode_order(text: bytes) -> Order:
@@ -248,6 +255,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         read_fence(fields.get("fence")),  # before protocol 3 neither of these
         read_time(fields.get("heard", 0.0)),
         read_limits(fields.get("limits", ())),
+        read_texts(fields.get("secrets", {})),
     )
 
 
@@ -398,7 +406,8 @@ def encode_welcome(
     """Return the answer to `hello`."""
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
-    return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups})
+    return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups,
+                 "secrets": True})  # fmt: skip
 
 
 def encode_status(status: Status) -> bytes:

@@ -30,6 +30,7 @@ from rosrm.supervisor import (
     own_log,
     paths,
     procfs,
+    secret_files,
     spawn,
     takeover,
 )
@@ -255,6 +256,7 @@ class Server:
                 environment.pop(name, None)
             else:
                 environment[name] = value
+        environment.update(secret_files.read_all(launch.secrets))
         environment[INSTANCE_MARK] = mark(launch.instance)
         environment[SUPERVISOR_MARK] = self._state
         return environment

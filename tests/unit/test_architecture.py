@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import rosrm_checkpoint.plugin
+import rosrm_container.plugin
 import rosrm_criu.plugin
 import rosrm_migration.plugin
 import rosrm_scoring.plugin
@@ -79,6 +80,7 @@ def test_no_name_of_a_shipped_plugin_decides_anything():
     """Core, configuration and slave ask for capabilities; the file of defaults alone has names."""
     shipped = Registry.of(
         checkpoint=rosrm_checkpoint.plugin,
+        container=rosrm_container.plugin,
         criu=rosrm_criu.plugin,
         migration=rosrm_migration.plugin,
         scoring=rosrm_scoring.plugin,

@@ -67,7 +67,7 @@ OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJEC
 
 
 def test_every_distribution_is_looked_at() -> None:
-    parts = "checkpoint criu examples lab migration msgs resources scoring simulate"
+    parts = "checkpoint container criu examples lab migration msgs resources scoring simulate"
     assert {"rosrm", *(f"rosrm-{part}" for part in parts.split())} <= OWN
 
 

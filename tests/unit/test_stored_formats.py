@@ -125,7 +125,8 @@ EVENTS: list[tuple[happened.Event, str]] = [
             '{"kind":"HostRegistered","request":1,"description":{"name":"h","incarnation":5,'
             '"hostname":"","pid":0,"software_version":"","labels":{"arm":"yes"},"resources":'
             '[{"name":"cpu","unit":"core","capacity":4.0,"scope":"machine","accounting":"countable"'
-            '}],"max_processes":0,"period":0.1,"executors":[],"absent":{},"unenforced":{},"cpus":[],"devices":[]},"instances":[],'
+            '}],"max_processes":0,"period":0.1,"executors":[],"absent":{},"unenforced":{},"cpus":[],"devices":[],'
+            '"launchers":[]},"instances":[],'
             '"journal_seen":0,"snapshots":[]}'
         ),
     ),

@@ -11,7 +11,7 @@ from rosrm.model.values import Kind, ProcessSpec
 
 #: Fields that identify a process, its program and its kind, and so have no default of the cluster.
 IDENTITY: Final = (
-    "namespace", "package", "executable", "module", "command", "ros", "kind",
+    "namespace", "package", "executable", "module", "command", "ros", "kind", "container",
 )  # fmt: skip
 #: Fields that relate the processes of one file to each other, and so have none, either.
 _OF_ONE_FILE: Final = (
@@ -57,13 +57,19 @@ def _chosen(spec: ProcessSpec, defaults: ProcessSpec) -> Iterator[tuple[str, Any
         if not _applies(path, default, spec):
             continue
         if isinstance(own, Mapping):
-            value = {**default, **own}
+            value = {**_without_set(default, path, spec), **own}
         elif path in defaults.given and _is_left_out(path, own, built_in, spec):
             value = default
         else:
             continue
         if value != own:
             yield path, value
+
+
+def _without_set(defaults: Mapping[str, Any], path: str, spec: ProcessSpec) -> Mapping[str, Any]:
+    """Return the defaults of a mapping, without variables that the process sets in another way."""
+    others = {"environment": spec.secrets, "secrets": spec.environment}.get(path, {})
+    return {name: value for name, value in defaults.items() if name not in others}
 
 
 def _leaves(

@@ -32,7 +32,7 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
-from rosrm.extensions.declared_fields import no_standby
+from rosrm.extensions.declared_fields import container_conflict, no_standby
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.limits import limits_fault
@@ -200,7 +200,7 @@ def submission_fault(
 
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
-    """Return why the limits, the migration or the standby of a spec are refused; "": not."""
+    """Return why limits, migration, standby or container of a spec are refused; "": not."""
     fault = limits_fault(spec)
     if fault:
         return fault
@@ -212,7 +212,7 @@ def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
         return f"migration by {strategy!r}: {fault}"
     if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
         return no_standby(strategy, state.declared.capabilities)
-    return ""
+    return container_conflict(spec, state.declared.capabilities_of(spec))
 
 
 #: Paths of the fields that `_spec_fault` checks.

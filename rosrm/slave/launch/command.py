@@ -24,6 +24,11 @@ from rosrm.supervisor.client_values import LaunchOrder, limit_rule
 #: Most bytes of command line and environment, as the supervisor receives them; the rest of its
 #: longest line is for the other fields.
 _LONGEST: Final = json_lines.LONGEST_LINE - (1 << 16)
+#: Shell script that becomes an executable of a ROS package; `ros2 run` would stay its parent, and
+#: would not pass on a signal that only the container's first process gets.
+_RUN_PACKAGE: Final = (
+    'p=$1 e=$2; shift 2; d=$(ros2 pkg prefix "$p") || exit 127; exec "$d/lib/$p/$e" "$@"'
+)
 #: Characters that are always short enough: JSON has at most 12 bytes for each.
 _SHORT: Final = _LONGEST // 16
 
@@ -68,6 +73,7 @@ def launch_order(
         fence=assignment.fence,
         last_contact=last_contact,
         limits=limit_rule(spec),
+        secrets=spec.secrets,
     )
 
 
@@ -103,6 +109,8 @@ def _at_home(path: str, where: str) -> str:
 
 def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> tuple[str, ...]:
     """Return the part of the command line before the arguments."""
+    if spec.container.image:
+        return command_in_image(spec)
     if spec.package is not None:
         if spec.executable is None:
             raise LaunchError(f"{spec.name!r} names the package {spec.package!r}, no executable")
@@ -114,6 +122,15 @@ def _command(spec: ProcessSpec, environment: Mapping[str, str], python: str) -> 
         raise LaunchError(f"{spec.name!r} has nothing to run: set package, module or command")
     program, *words = spec.command
     return (_at_home(program, "command"), *words)
+
+
+def command_in_image(spec: ProcessSpec) -> tuple[str, ...]:
+    """Return a command that finds the program in the image of a container."""
+    if spec.package is not None:
+        return ("sh", "-c", _RUN_PACKAGE, "sh", spec.package, spec.executable or "")
+    if spec.module is not None:
+        return ("python3", "-m", spec.module)
+    return spec.command
 
 
 def _arguments(assignment: Assignment, state_directory: Path) -> list[str]:

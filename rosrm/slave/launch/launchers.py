@@ -74,7 +74,8 @@ class Launchers:
             LaunchError: the instance cannot be started here.
         """
         instance, restored = launch.assignment.instance, launch.assignment.restored
-        own = self.capabilities_of(launch.assignment.spec).launcher
+        spec = launch.assignment.spec
+        own = spec.container.engine or self.capabilities_of(spec).launcher
         if own and own not in self.made:
             reason = self.unusable.get(own, "not installed")
             raise LaunchError(f"{instance} needs the launcher {own!r}, which is {reason}")

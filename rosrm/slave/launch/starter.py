@@ -25,6 +25,7 @@ from rosrm.slave.memos import to_memo
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.supervisor.secret_files import is_exposed
 from rosrm.wording import one_line
 
 _log = logging.getLogger("rosrm.slave")
@@ -55,6 +56,7 @@ class Starter:
     _environment: Mapping[str, str] = field(init=False)
     _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
+    _warned_of: set[str] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
         self._environment = {**os.environ, **self.config.ros.environment()}
@@ -128,6 +130,7 @@ class Starter:
                 before = self.graph.endpoints(held.awaited.node_name)
                 self._graph_before[assignment.instance] = before
             try:
+                self._check_secrets(assignment)
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
                     state_directory=self.supervisor.state, launchers=self.launchers,
@@ -141,6 +144,23 @@ class Starter:
                 self.take(events.LaunchRefused(assignment.instance, str(error)))
         if orders:
             self.supervisor.start(orders)
+
+    def _check_secrets(self, assignment: Assignment) -> None:
+        """Warn of secrets that every user of this host may read; raises `LaunchError`."""
+        secrets = assignment.spec.secrets
+        if secrets and not self.supervisor.reads_secrets:
+            raise LaunchError(
+                f"{assignment.instance}: a supervisor of an earlier version runs here, which reads "
+                "no secrets; it ends when all its processes have ended"
+            )
+        for path in secrets.values():
+            if path not in self._warned_of and is_exposed(path):
+                self._warned_of.add(path)
+                _log.warning(
+                    "%s: the file of a secret may be read or changed by every user of this host; "
+                    "`chmod o-rw %s` prevents this",
+                    assignment.instance, path,
+                )  # fmt: skip
 
     def _location(self) -> ProcessLocation:
         config = self.config

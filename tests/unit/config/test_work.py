@@ -12,6 +12,7 @@ from rosrm.errors import ConfigError
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
+    Container,
     Kind,
     Limits,
     MigrationPolicy,
@@ -106,6 +107,10 @@ def test_every_key_is_read(file):
         ("command: x, near: []", "neighbours", ()),
         ("command: x, talks_to: {b: 30MB/s, c: 5}", "talks_to", {"b": 30e6, "c": 5.0}),
         ("command: x, talks_to: {memory: 1KiB/s}", "talks_to", {"memory": 1024.0}),
+        ("command: x, secrets: {T: {file: /etc/t}}", "secrets", {"T": "/etc/t"}),
+        ("command: x, secrets:", "secrets", {}),
+        ("command: x, container: ros:jazzy", "container", Container("ros:jazzy", "podman")),
+        ("command: x, container: {image: a, engine: b}", "container", Container("a", "b")),
         (
             "command: x, apart: [b, {processes: [d], by: rack, prefer: true}, 5]",
             "neighbours",
@@ -194,12 +199,22 @@ def test_the_processes_of_one_entry_are_one_group(file):
         ),
         ("after: {delay: 2s}", "after: the name of at least one process is required"),
         ("after: 5", "after: a mapping is required, not 5"),
+        ("secrets: {T: {file: t}}", "secrets.T: 't' is no absolute path. A host reads the file"),
+        ("secrets: {T: {file: ~/t}}", "secrets.T: '~/t' is no absolute path"),
+        ("secrets: {T: {file: /t}}, environment: {T: x}", "secrets.T: `environment` sets T, too"),
+        ("secrets: {A=B: {file: /t}}", "secrets: 'A=B' cannot be a variable"),
+        ("secrets: {PATH: {file: /t}}", "secrets.PATH: rosrm itself sets or reads PATH"),
+        ("secrets: {ROSRM_HOST: {file: /t}}", "secrets.ROSRM_HOST: rosrm itself sets or reads"),
+        ("container: {engine: podman}", "container.image: is missing"),
+        ("container: --privileged", "container.image '--privileged': a name is required"),
+        ("secrets: {T: {fiel: /t}}", "unknown key 'fiel' in secrets.T; did you mean 'file'?"),
+        ("secrets: {T: /t}", 'secrets.T: a mapping is required, not "/t"'),
         ("near: [[b]]", "near[0].processes[0]: text is required, not a list"),
         ("spread: {groups: g}", "unknown key 'groups' in spread; did you mean 'group'?"),
         ("near: {processes: [b], prefer: 1}", "near[0].prefer: true or false is required, not 1"),
     ],
 )
-def test_faults_of_neighbours_are_named(file, entry, text):
+def test_faults_of_neighbours_flows_and_secrets_are_named(file, entry, text):
     path = file(
         f"""
         processes:
@@ -569,6 +584,16 @@ def test_a_standby_needs_a_strategy_that_can_shadow(file, refusal):
     for known in (registry, None):
         (spec,) = load_work(file(text.replace("STRATEGY", "follow")), known)
         assert spec.standby.wanted
+
+
+def test_a_container_needs_a_strategy_that_starts_the_process_again(file, refusal):
+    """Neither its memory nor its snapshots can be moved; without a registry the master refuses."""
+    text = "processes: [{name: a, command: x, container: img, migration: STRATEGY}]"
+    keeps = MigrationOffer("keep", lambda options: options, capabilities=Capabilities("memory"))
+    said = refusal(load_work, text.replace("STRATEGY", "keep"), registry_of(RELAUNCH, keeps))
+    assert "f.yaml:1:46: keep moves the state of a process, which is not possible with a" in said
+    (spec,) = load_work(file(text.replace("STRATEGY", "relaunch")), registry_of(RELAUNCH, keeps))
+    assert spec.program == "x in img"
 
 
 @dataclass(frozen=True)

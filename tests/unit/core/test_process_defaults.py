@@ -58,6 +58,16 @@ def test_mappings_are_merged_and_the_entries_of_the_process_count() -> None:
     assert filled == ("environment",)
 
 
+def test_a_process_sets_each_variable_in_one_way() -> None:
+    """A variable or secret of a process replaces defaults of the same name in both mappings."""
+    given = defaults("environment", environment={"A": "cluster", "B": "cluster"})
+    spec, _ = with_defaults(process("p", secrets={"A": "/own"}), given)
+    assert (spec.environment, spec.secrets) == ({"B": "cluster"}, {"A": "/own"})
+    given = defaults("secrets", secrets={"A": "/cluster", "B": "/cluster"})
+    spec, _ = with_defaults(process("p", environment={"A": "own"}), given)
+    assert (spec.environment, spec.secrets) == ({"A": "own"}, {"B": "/cluster"})
+
+
 def test_identity_and_program_have_no_default() -> None:
     """The placeholder's name and program are of no meaning."""
     own = process("p")

@@ -112,7 +112,7 @@ def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
     wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
-    wanted |= {"limits", "realtime", "after.delay", "after.on_restart"}
+    wanted |= {"limits", "realtime", "container", "after.delay", "after.on_restart"}
     wanted |= {"group", *keys(GroupInFile, "group.")}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}

@@ -208,6 +208,10 @@ def asked(**fields):
     return [msg.DeviceNeed(**{"kind": "gpu", "amount": 1.0, **fields})]
 
 
+def variable(name: str, value: str) -> list[msg.KeyValue]:
+    return [msg.KeyValue(key=name, value=value)]
+
+
 NONSENSE_IN_SPECS = {
     "no name": lambda m: setattr(m, "name", ""),
     "a name with an escape": lambda m: setattr(m, "name", "p\x1b[2J"),
@@ -264,6 +268,16 @@ NONSENSE_IN_SPECS = {
     "a flow that is no number": lambda m: setattr(
         m, "talks_to", [msg.ProcessFlow(process="q", rate=float("nan"))]
     ),
+    "a secret in a relative file": lambda m: setattr(m, "secrets", variable("TOKEN", "token")),
+    "a secret that is also a variable": lambda m: (
+        setattr(m, "secrets", variable("TOKEN", "/t")),
+        setattr(m, "environment", variable("TOKEN", "x")),
+    ),
+    "an engine without an image": lambda m: setattr(m.container, "engine", "podman"),
+    "an option as an image": lambda m: setattr(
+        m, "container", msg.Container(image="-v", engine="x")
+    ),
+    "many secrets": lambda m: setattr(m, "secrets", variable("TOKEN", "/t") * 257),
     "many flows": lambda m: setattr(m, "talks_to", [msg.ProcessFlow(process="q")] * 257),
     "many neighbours": lambda m: setattr(m, "neighbours", neighbour() * 257),
     "a start after itself": lambda m: setattr(m.start_order, "after", [pair("p", "ready")]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,9 +14,11 @@ import yaml
 from hypothesis import given
 
 from rosrm.errors import LaunchError
+from rosrm.extensions.made import MadeLauncher
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.values import (
     Assignment,
+    Container,
     InstanceId,
     Kind,
     ProcessSpec,
@@ -24,7 +27,7 @@ from rosrm.model.values import (
 )
 from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
-from rosrm.slave.launch.command import launch_order
+from rosrm.slave.launch.command import command_in_image, launch_order
 from rosrm.slave.launch.environment import (
     ProcessLocation,
     process_environment,
@@ -64,6 +67,44 @@ def launched(tmp_path, given: Assignment, environment=None, python=sys.executabl
 def order(tmp_path, environment=None, **fields):
     environment = {"PATH": "/usr/bin", **(environment or {})}
     return launched(tmp_path, assignment(**fields), environment)
+
+
+class InImage:
+    """A launcher that changes nothing."""
+
+    def prepare(self, launch):
+        return launch
+
+
+def test_programs_of_a_container_are_found_in_its_image(tmp_path):
+    """The host may have neither the package nor the interpreter."""
+    launchers = Launchers({"podman": MadeLauncher(InImage(), ())})
+    expected = {
+        ("module", "demo.node"): ("python3", "-m", "demo.node", "x"),
+        ("command", ("run", "-v")): ("run", "-v", "x"),
+    }
+    for (key, value), argv in expected.items():
+        given = assignment(
+            **{key: value}, arguments=("x",), container=Container("ros:jazzy", "podman")
+        )
+        made = launch_order(
+            given, {}, sys.executable, where=HERE, state_directory=tmp_path, launchers=launchers
+        )
+        assert made.argv == argv
+
+
+def test_an_executable_in_an_image_becomes_the_process_itself(tmp_path, monkeypatch):
+    """A script asks `ros2` of the image for the prefix of the package."""
+    ros2, program = tmp_path / "ros2", tmp_path / "lib" / "demo" / "talk"
+    program.parent.mkdir(parents=True)
+    ros2.write_text(f"#!/bin/sh\n[ $3 = demo ] && echo {tmp_path}\n")
+    program.write_text("#!/bin/sh\necho $$ $*\n")
+    ros2.chmod(0o755)
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    command = command_in_image(ProcessSpec("p", package="demo", executable="talk"))
+    with subprocess.Popen([*command, "a b"], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.read() == f"{process.pid} a b\n"
 
 
 @pytest.fixture

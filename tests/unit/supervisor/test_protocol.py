@@ -61,6 +61,7 @@ ORDERS = st.one_of(
         st.none() | st.builds(FenceRule, SECONDS, SECONDS, st.booleans()),
         SECONDS,
         LIMITS,
+        st.dictionaries(WORDS, WORDS),
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),

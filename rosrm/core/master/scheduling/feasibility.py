@@ -41,7 +41,9 @@ def why_never(table: HostTable, demand: Demand) -> str:
     """
     if not len(table) or possible(table, demand).any():
         return ""
-    unknown = _unmeasured(table, demand) or _unknown_device(table, demand)
+    unknown = (
+        _unmeasured(table, demand) or _unknown_device(table, demand) or _no_engine(table, demand)
+    )
     if unknown:
         return unknown
     alone = "; there is no other host" if len(table.listed()) == 1 else ""
@@ -151,3 +153,12 @@ def _unknown_device(table: HostTable, demand: Demand) -> str:
             hint = f"; did you mean {near[0]!r}?" if near else ""
             return f"no host has a {need.kind!r} among its devices{hint} (there: {listed(there)})"
     return ""
+
+
+def _no_engine(table: HostTable, demand: Demand) -> str:
+    """Return a sentence on an engine of containers that no host offers; "": none."""
+    engine = demand.spec.container.engine
+    if not engine or table.launching(engine).any():
+        return ""
+    there = {name for host in table.hosts for name in host.description.launchers}
+    return f"no host offers {engine} for containers (launchers there: {listed(sorted(there))})"

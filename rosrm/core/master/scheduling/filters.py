@@ -172,6 +172,15 @@ def _to_enforce(hosts: Candidates) -> tuple[tuple[str, ...], tuple[int, ...]]:
     return (spec.enforcement if spec.limits.enforce == "required" else ()), spec.cpus
 
 
+def _has_launcher(hosts: Candidates) -> BoolArray | None:
+    engine = hosts.demand.spec.container.engine
+    return hosts.table.launching(engine)[hosts.columns] if engine else None
+
+
+def _why_no_launcher(hosts: Candidates, row: int) -> str:
+    return f"it does not offer {hosts.demand.spec.container.engine}"
+
+
 # --- neighbours -------------------------------------------------------------------------------
 
 
@@ -340,6 +349,7 @@ FILTERS: Final = (
     EXCLUSION,
     Filter("labels", _has_labels, _why_no_labels, Lasts.PERMANENT),
     Filter("resources", _has_resources, _why_no_resources, Lasts.PERMANENT),
+    Filter("container", _has_launcher, _why_no_launcher, Lasts.PERMANENT),
     Filter("enforcement", _can_enforce, _why_not_enforced, Lasts.PERMANENT),
     NEIGHBOURS,
     LINKS,

@@ -152,6 +152,7 @@ class HostTable(HostColumns):
         self.devices = DeviceTable()
         self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}
+        self._launching: dict[str, BoolArray] = {}
         self._enforcing: dict[tuple[tuple[str, ...], tuple[int, ...]], BoolArray] = {}
         self._listed: list[Host] | None = None
 
@@ -202,6 +203,7 @@ class HostTable(HostColumns):
         self.links.forget(column)
         self._labelled.clear()
         self._enforcing.clear()
+        self._launching.clear()
         self.set_devices(host, description.devices)
         return host
 
@@ -227,6 +229,7 @@ class HostTable(HostColumns):
         self.links.forget(host.column)
         self._labelled.clear()
         self._enforcing.clear()
+        self._launching.clear()
         self.set_devices(host, ())
         self.set_closed(host, cordoned=False, draining=False)
         self.set_condition(host, HostCondition.LEFT)
@@ -269,6 +272,14 @@ class HostTable(HostColumns):
         if known is None or len(known) != len(self):
             found = [host.enforces(settings, cpus) for host in self.hosts]
             known = self._enforcing[settings, cpus] = np.array(found, np.bool_)
+        return known
+
+    def launching(self, launcher: str) -> BoolArray:
+        """Return the mask, (H,), of hosts that offer a launcher; cached until a host registers."""
+        known = self._launching.get(launcher)
+        if known is None or len(known) != len(self):
+            found = [launcher in host.description.launchers for host in self.hosts]
+            known = self._launching[launcher] = np.array(found, np.bool_)
         return known
 
     # --- changes -------------------------------------------------------------------------

@@ -1,0 +1,1 @@
+"""Processes in containers: the launcher `podman`."""
