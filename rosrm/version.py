@@ -5,4 +5,4 @@ from typing import Final
 __version__: Final = "0.1.0"
 
 #: Increased with every change of `rosrm_msgs` or its meaning; peers of other versions are refused.
-PROTOCOL_VERSION: Final = 7
+PROTOCOL_VERSION: Final = 8

@@ -12,6 +12,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+from rosrm.model.artifacts import Artifact, fetch_time
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 
 #: Slots of a `resource_info` message: highest number of resources of one host.
@@ -272,6 +273,7 @@ class ProcessSpec:
         cpus: numbers of the CPUs that it may use; (): all.
         nice: its niceness, -20..19; 0: that of the slave.
         devices: devices that it holds while it runs, each kind once.
+        artifacts: files and directories that it gets on its host, in the order of their names.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -312,6 +314,7 @@ class ProcessSpec:
     realtime: Realtime = Realtime()
     nice: int = 0
     devices: tuple[DeviceNeed, ...] = ()
+    artifacts: tuple[Artifact, ...] = ()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -327,6 +330,11 @@ class ProcessSpec:
             "limits.cpu": self.limits.cpu, "realtime": self.realtime.policy, "nice": self.nice < 0,
         }  # fmt: skip
         return tuple(name for name, value in settings.items() if value)
+
+    @property
+    def fetch_time(self) -> float:
+        """Return the seconds that a move adds to the time-out of a start, for its artifacts."""
+        return fetch_time(self.artifacts)
 
     @property
     def program(self) -> str:

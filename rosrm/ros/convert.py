@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
+from rosrm.model.artifacts import Artifact, artifacts_fault, contents_fault
 from rosrm.model.description_checks import (
     description_fault,
     is_namespace,
@@ -170,6 +171,9 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
         talks_to=[
             msg.ProcessFlow(process=name, rate=float(rate)) for name, rate in spec.talks_to.items()
         ],
+        artifacts=[
+            msg.Artifact(name=one.name, digest=one.digest, size=one.size) for one in spec.artifacts
+        ],
     )  # fmt: skip
 
 
@@ -190,6 +194,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
             options=json_object(message.migration.options, "migration options"),
         ),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
+        artifacts=_artifacts(message),
     )  # fmt: skip
     fault = limits_fault(spec)
     if fault:
@@ -214,6 +219,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _neighbours_fault(message)
         or _devices_fault(message)
         or _flows_fault(message)
+        or _artifacts_fault(message)
     )
 
 
@@ -255,6 +261,16 @@ def _neighbours_fault(message: msg.ProcessSpec) -> str:
 def _devices_fault(message: msg.ProcessSpec) -> str:
     fault = need_fault(_from_msg(DeviceNeed, need) for need in message.devices)
     return f"devices: {fault}" if fault else ""
+
+
+def _artifacts(message: msg.ProcessSpec) -> tuple[Artifact, ...]:
+    return tuple(Artifact(one.name, one.digest, one.size) for one in message.artifacts)
+
+
+def _artifacts_fault(message: msg.ProcessSpec) -> str:
+    artifacts = _artifacts(message)
+    fault = artifacts_fault(artifacts) or contents_fault(artifacts)
+    return f"artifacts: {fault}" if fault else ""
 
 
 def _held(message: msg.Assignment | msg.ProcessStatus) -> tuple[HeldDevice, ...]:
