@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
 from rosrm.extensions.units import Amount, ByteRate, Count, PositiveSeconds, Quantity, Seconds
+from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER, artifacts_fault, artifacts_of
 from rosrm.model.description_checks import is_namespace, name_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
 from rosrm.model.limits import LARGEST_CPU_NUMBER, limits_fault
@@ -216,6 +217,7 @@ class ProcessInFile:
     realtime: RealtimeInFile | None = None
     nice: Annotated[int, Quantity(low=-20, high=19, whole=True)] = 0
     devices: AskedByKind = field(default_factory=lambda: EMPTY)
+    artifacts: Annotated[Mapping[str, Text], NullIsEmpty()] = field(default_factory=lambda: EMPTY)
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -245,6 +247,7 @@ class ProcessInFile:
             limits=_same(Limits, self.limits),
             realtime=Realtime() if self.realtime is None else _same(Realtime, self.realtime),
             devices=tuple(replace(need, kind=kind) for kind, need in self.devices.items()),
+            artifacts=artifacts_of(self.artifacts),
             given=(),
         )
 
@@ -361,6 +364,19 @@ def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
             )
 
 
+def _about_artifacts(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = artifacts_fault(spec.artifacts)
+    if fault:
+        yield Complaint(("artifacts",), f"artifacts: {fault}")
+    for one in spec.artifacts:
+        if not one.source:
+            yield Complaint(("artifacts", one.name), f"artifacts.{one.name}: a path is required")
+    for key in _WITH_PLACEHOLDER if not spec.artifacts else ():
+        if ARTIFACTS_PLACEHOLDER in repr(getattr(spec, key)):
+            text = f"{key}: {ARTIFACTS_PLACEHOLDER} needs `artifacts:`, which the process does not have"
+            yield Complaint((key,), text)
+
+
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
     for name in spec.talks_to:
         fault = name_fault(name, "process")
@@ -461,6 +477,10 @@ def _fault_of_parameter(value: Any) -> str:
 
 _Rule = Callable[[ProcessSpec], Iterator[Complaint]]
 _PROGRAM: Final = ("package", "executable", "module", "command")
+#: Fields in which `{artifacts}` stands for the directory of the artifacts.
+_WITH_PLACEHOLDER: Final = (
+    "command", "arguments", "parameters", "environment", "working_directory",
+)  # fmt: skip
 #: Each rule with the keys that it reads.
 _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
@@ -472,6 +492,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_devices, ("devices", "arguments", "parameters")),
+    (_about_artifacts, ("artifacts", *_WITH_PLACEHOLDER)),
     (_about_flows, ("name", "talks_to")),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),
 )

@@ -7,6 +7,7 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm.artifacts.pack import source_fault
 from rosrm.config.checking import near, salvaged
 from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
@@ -14,7 +15,13 @@ from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, complaints
-from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
+from rosrm.config.rules import (
+    check_amounts,
+    check_name,
+    refuse_namesakes,
+    settled,
+    settled_on_host,
+)
 from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import ProcessSpec
@@ -25,19 +32,22 @@ _SECTIONS: Final = ("processes", "defaults")
 _NOT_IN_DEFAULTS: Final = ("name", "foreach")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
 _NOT_IN_CLUSTER_DEFAULTS: Final = (
-    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to",
+    *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "artifacts",
 )  # fmt: skip
 
 
-def load_work(path: str | Path, registry: Registry | None = None) -> tuple[ProcessSpec, ...]:
+def load_work(
+    path: str | Path, registry: Registry | None = None, *, check_artifacts: bool = True
+) -> tuple[ProcessSpec, ...]:
     """Read the processes of a file; raises one `ConfigError` with all problems.
 
     Args:
         path: path of the file.
         registry: the installed plugins, for a check of the migration strategies; None: only the
             master checks them.
+        check_artifacts: False: the files of `artifacts` need not exist.
     """
-    return checked_work(read(path), path, registry)
+    return checked_work(read(path), path, registry, check_artifacts=check_artifacts)
 
 
 def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
@@ -52,7 +62,7 @@ def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
 
 
 def checked_work(
-    root: Node, path: str | Path, registry: Registry | None
+    root: Node, path: str | Path, registry: Registry | None, *, check_artifacts: bool = True
 ) -> tuple[ProcessSpec, ...]:
     """Return the processes of a parsed document; otherwise as `load_work`."""
     problems = Problems()
@@ -67,6 +77,8 @@ def checked_work(
     ]
     specs = [_process(node, path, plugins, problems) for node in nodes]
     refuse_namesakes(nodes, "process", problems)
+    if check_artifacts:
+        _check_sources(nodes, specs, problems)
     problems.raise_any()
     return tuple(spec for spec in specs if spec is not None)
 
@@ -168,6 +180,20 @@ def _process(
     return spec
 
 
+def _check_sources(
+    nodes: Sequence[Node], specs: Sequence[ProcessSpec | None], problems: Problems
+) -> None:
+    """Note the artifacts that are no files or directories, each path once."""
+    checked: set[str] = set()
+    for node, spec in zip(nodes, specs, strict=True):
+        for one in spec.artifacts if spec is not None else ():
+            fault = source_fault(one.source) if one.source and one.source not in checked else ""
+            checked.add(one.source)
+            if fault:
+                place = node.deepest(("artifacts", one.name)).place
+                problems.add(place, f"artifacts.{one.name}: {fault}")
+
+
 def _given(node: Node, value: Any, before: str = "") -> Iterator[str]:
     """Yield the paths of the keys in an entry: of each field, and of each field of a policy."""
     for name, inner in node.items.items():
@@ -194,10 +220,14 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
 
 
 def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:
-    """Return the spec with its program and directory resolved by `settled_on_host`."""
+    """Return the spec with its program, directory and artifacts resolved against the file."""
     directory, command = spec.working_directory, spec.command
     if directory:
         spec = replace(spec, working_directory=settled_on_host(directory, path))
     if command and "/" in command[0]:
         spec = replace(spec, command=(settled_on_host(command[0], path), *command[1:]))
-    return spec
+    here = (
+        replace(one, source=str(settled(Path(one.source), path))) if one.source else one
+        for one in spec.artifacts
+    )
+    return replace(spec, artifacts=tuple(here))
