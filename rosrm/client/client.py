@@ -85,9 +85,18 @@ class Client:
                 and so on), a `ProcessSpec`, or several of these.
 
         Raises:
-            ConfigError: a file or a mapping is invalid; nothing was sent.
+            ConfigError: a file or a mapping is invalid, or an artifact cannot be read; nothing was
+                queued.
         """
-        return self._master.submit(_specs(work))
+        return self._master.submit(self._sent(_specs(work)))
+
+    def _sent(self, specs: Sequence[ProcessSpec]) -> Sequence[ProcessSpec]:
+        """Send the contents of artifacts to the master; return the specs with the digests."""
+        if not any(one.source for spec in specs for one in spec.artifacts):
+            return specs
+        from rosrm.client.artifacts import send_artifacts  # noqa: PLC0415 - only for artifacts
+
+        return send_artifacts(self._master, specs, self._notify)
 
     def cancel(self, processes: Names) -> str:
         """Take processes out of the queue, or stop them for good; return the master's message."""

@@ -77,6 +77,9 @@ class Queries(Protocol):
     def number_of(self, host: str) -> int | None:
         """Return the number of a host; None: there is no host of that name."""
 
+    def has_artifact(self, digest: str, size: int, /) -> bool:
+        """Return True if the contents with a digest and a size are stored."""
+
 
 class MasterServices:
     """All services of the master; requests become events for `handle`.
@@ -115,7 +118,7 @@ class MasterServices:
         offer(srv.RegisterHost, path(names.REGISTER_HOST), self._take_registration)
         for kind, name, event in (
             (srv.Leave, names.LEAVE, self._left),
-            (srv.Submit, names.SUBMIT, _submitted),
+            (srv.Submit, names.SUBMIT, self._submitted),
             (srv.Cancel, names.CANCEL, _cancelled),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
@@ -171,6 +174,18 @@ class MasterServices:
         if kind is srv.Migrate:
             response.host = reply.host
         return response
+
+    def _submitted(self, request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
+        specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
+        for spec in specs:
+            for one in spec.artifacts:
+                if not self._queries.has_artifact(one.digest, one.size):
+                    raise Refused(
+                        f"process {spec.name!r}: the master does not have the contents of artifact "
+                        f"{one.name!r}; nothing was queued: submit again",
+                        "unknown",
+                    )
+        return happened.SubmissionReceived(token, specs, _requester(peer))
 
     # --- slaves --------------------------------------------------------------------------
 
@@ -359,11 +374,6 @@ def _check_name(slave: Peer, name: str) -> None:
             f"{own} may not register as {name!r}: a slave registers only the host of its key",
             "denied",
         )
-
-
-def _submitted(request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
-    specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
-    return happened.SubmissionReceived(token, specs, _requester(peer))
 
 
 def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:
