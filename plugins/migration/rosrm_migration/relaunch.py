@@ -37,7 +37,7 @@ class Relaunch:
         """Return the plan: start, await ready, commit, stop the source; or with the stop first."""
         if move.spec.migration.overlap:
             return _start_first(move, move.options)
-        return _stop_first(move, move.options.start_timeout)
+        return _stop_first(move, move.options.start_timeout + move.spec.fetch_time)
 
 
 def _start_first(move: Move, options: RelaunchOptions) -> Plan:
@@ -46,7 +46,8 @@ def _start_first(move: Move, options: RelaunchOptions) -> Plan:
     return Plan(
         (
             Start(
-                move.destination, move.destination_host, options.start_timeout,
+                move.destination, move.destination_host,
+                options.start_timeout + move.spec.fetch_time,
                 undo=_stop_destination(move),
             ),
             AwaitReady(move.destination, move.destination_host, ready, settle=settle),
