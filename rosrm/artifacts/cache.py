@@ -184,18 +184,19 @@ class ArtifactCache:
         sizes = {path: _size_of(path) for path in _entries(self._root / "trees")}
         taken = sum(sizes.values()) + sum(one.artifact.size for one in self._incoming)
         unused = [path for path in sizes if path.name not in in_use]
+        stays = taken - sum(map(sizes.__getitem__, unused))
+        if stays + artifact.size > self._max_size:
+            raise Refused(
+                f"artifact {artifact.name!r} has {sized(artifact.size)}, and the artifacts of this "
+                f"host may have {sized(self._max_size)} in all, of which {sized(stays)} are in "
+                "use; raise `artifacts.max_size` in its host.yaml",
+                "full",
+            )
         for path in sorted(unused, key=lambda path: path.stat().st_mtime):
             if taken + artifact.size <= self._max_size:
                 return
             self._delete(path, used)
             taken -= sizes[path]
-        if taken + artifact.size > self._max_size:
-            raise Refused(
-                f"artifact {artifact.name!r} has {sized(artifact.size)}, and the artifacts of this "
-                f"host may have {sized(self._max_size)} in all, of which {sized(taken)} are in use; "
-                "raise `artifacts.max_size` in its host.yaml",
-                "full",
-            )
 
     def _delete(self, tree: Path, used: Used) -> None:
         """Delete an artifact, and all unused sets, whose hard links would keep its contents."""

@@ -129,7 +129,9 @@ class Archive:
 
 def changed(source: str | Path) -> Refused:
     """Return the refusal of contents that differ from their digest."""
-    return Refused(f"{source} changed while it was sent; nothing was queued: submit again", "changed")
+    return Refused(
+        f"{source} changed while it was sent; nothing was queued: submit again", "changed"
+    )
 
 
 def _content(entry: _Entry) -> Iterator[bytes]:
@@ -182,14 +184,14 @@ def _below(root: Path, directory: Path, before: str) -> Iterator[_Entry]:
             yield _Entry(whole, path, status.st_mode, target=_target(root, path, name))
         else:
             raise ConfigError(
-                f"{path}: neither a file, a directory nor a link; devices, sockets and pipes cannot "
-                "be in an artifact"
+                f"{path}: neither a file, a directory nor a link; devices, sockets and pipes "
+                "cannot be in an artifact"
             )
 
 
 def _target(root: Path, path: Path, name: str) -> str:
     """Return the target of a link; raise `ConfigError` if the link leaves the directory."""
-    target = os.readlink(path)
+    target = str(path.readlink())
     fault = link_fault(name, target)
     if not fault and not path.resolve().is_relative_to(root):
         fault = f"{target!r} lies outside of the directory"

@@ -205,19 +205,20 @@ class ArtifactStore:
             digest for digest in self._sizes
             if digest not in keep and now - self._offered.get(digest, -_GRACE) >= _GRACE
         ]  # fmt: skip
+        stays = taken - sum(map(self._sizes.__getitem__, old))
+        if stays + size > self._max_size:
+            raise Refused(
+                f"the master has no room for an artifact of {sized(size)}: its store may have "
+                f"{sized(self._max_size)}, and {sized(stays)} are in use; remove ended processes "
+                "with `rosrm prune`, or raise `artifacts.max_size` in cluster.yaml",
+                "full",
+            )
         old.sort(key=lambda digest: self._offered.get(digest, 0.0))
         for digest in old:
             if taken + size <= self._max_size:
                 return
             (self._root / digest).unlink(missing_ok=True)
             taken -= self._sizes.pop(digest)
-        if taken + size > self._max_size:
-            raise Refused(
-                f"the master has no room for an artifact of {sized(size)}: its store may have "
-                f"{sized(self._max_size)}, and {sized(taken)} are in use; remove ended processes "
-                "with `rosrm prune`, or raise `artifacts.max_size` in cluster.yaml",
-                "full",
-            )
 
 
 def _changed(digest: str) -> Refused:

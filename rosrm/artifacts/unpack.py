@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 #: Name of the file or directory in an archive, and where it is unpacked.
 CONTENT: Final = "content"
 #: Most files, directories and links of one artifact.
-MOST_ENTRIES: Final = 50_000
+MOST_ENTRIES: Final = 20_000
 #: Time of modification of all that is unpacked (1980-01-01); another one shows a change.
 _TIME: Final = 315_532_800
 _TIMES: Final = (_TIME, _TIME)
@@ -27,9 +28,9 @@ _WRITABLE: Final = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 def link_fault(name: str, target: str) -> str:
     """Return why a link may not have a target, by their texts alone; "" if it may."""
-    if not target or os.path.isabs(target):
+    if not target or target.startswith("/"):
         return f"{target!r:.200} is absolute, or empty"
-    inside = os.path.normpath(os.path.join(os.path.dirname(name), target))
+    inside = os.path.normpath(Path(name).parent / target)
     if inside == ".." or inside.startswith("../"):
         return f"{target!r:.200} lies outside of the directory"
     return ""
@@ -61,7 +62,6 @@ def unpack(archive: Path, directory: Path) -> None:
                     directories.append(entry.name)
                 else:
                     _write(tar, entry, path)
-                tar.members = []  # type: ignore[attr-defined] - tarfile keeps all entries in memory
     except (tarfile.TarError, ValueError, FileExistsError, FileNotFoundError) as error:
         raise TransferError(f"it is no sound archive: {error}") from None
     # Links come last, so that no file is written through one.
@@ -74,13 +74,9 @@ def unpack(archive: Path, directory: Path) -> None:
 
 def is_intact(directory: Path) -> bool:
     """Return True if nothing has changed below a directory since it was unpacked."""
+    content = directory / CONTENT
     try:
-        for root, below, files in os.walk(directory / CONTENT, onerror=_fail):
-            paths = [root, *(os.path.join(root, name) for name in (*below, *files))]
-            if not all(map(_is_untouched, paths)):
-                return False
-        content = directory / CONTENT
-        return content.is_dir() or _is_untouched(str(content))
+        return all(map(_is_untouched, _paths(content)))
     except OSError:
         return False
 
@@ -94,8 +90,16 @@ def remove(directory: Path) -> None:
     if not directory.exists():
         return
     for root, _, _ in os.walk(directory):
-        os.chmod(root, 0o700)
+        Path(root).chmod(0o700)
     shutil.rmtree(directory)
+
+
+def _paths(content: Path) -> Iterator[str]:
+    """Yield a file, or a directory and all that is in it; raises `OSError`."""
+    yield str(content)
+    if content.is_dir():
+        for root, directories, files in os.walk(content, onerror=_fail):
+            yield from (f"{root}/{name}" for name in (*directories, *files))
 
 
 def _fail(error: OSError) -> None:

@@ -77,28 +77,31 @@ def send_artifacts(
 
 
 def _send(master: _Master, source: str, archive: Archive, notify: Notify) -> None:
-    offset, notified, retries = _begun(master, archive), time.monotonic(), 0
+    offset, notified, retries = _stored(master, archive), time.monotonic(), 0
     while offset < archive.size:
         data = archive.part(offset, _PART)
-        answered = master.store_artifact(archive.digest, archive.size, offset, data)
+        answered = _stored(master, archive, offset, data)
         if answered == offset + len(data):
             offset = answered
         elif (retries := retries + 1) > _MOST_RETRIES:
             raise Refused("the master has lost what it had received; submit again", "changed")
         else:
-            offset = _begun(master, archive)
+            offset = _stored(master, archive)
         if time.monotonic() - notified >= _NOTIFY_PERIOD:
             notified = time.monotonic()
             notify(f"sends {source} to the master: {sized(offset)} of {sized(archive.size)}")
 
 
-def _begun(master: _Master, archive: Archive) -> int:
-    """Return the offset from which the master needs an archive."""
+def _stored(master: _Master, archive: Archive, offset: int = 0, data: bytes = b"") -> int:
+    """Send a part as soon as the master is not busy; return the offset of the next one.
+
+    Without data the master only returns the offset from which it needs the archive.
+    """
     for _ in range(_MOST_BUSY):
         try:
-            return master.store_artifact(archive.digest, archive.size, 0)
+            return master.store_artifact(archive.digest, archive.size, offset, data)
         except Refused as refusal:
             if refusal.code != "busy":
                 raise
         time.sleep(_BUSY)
-    return master.store_artifact(archive.digest, archive.size, 0)
+    return master.store_artifact(archive.digest, archive.size, offset, data)

@@ -373,7 +373,7 @@ def _about_artifacts(spec: ProcessSpec) -> Iterator[Complaint]:
             yield Complaint(("artifacts", one.name), f"artifacts.{one.name}: a path is required")
     for key in _WITH_PLACEHOLDER if not spec.artifacts else ():
         if ARTIFACTS_PLACEHOLDER in repr(getattr(spec, key)):
-            text = f"{key}: {ARTIFACTS_PLACEHOLDER} needs `artifacts:`, which the process does not have"
+            text = f"{key}: {ARTIFACTS_PLACEHOLDER} needs `artifacts:` in the process"
             yield Complaint((key,), text)
 
 

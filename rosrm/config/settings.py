@@ -274,12 +274,12 @@ class ArtifactStoreSettings:
 
     Attributes:
         max_size: most bytes of all contents together.
-        max_rate: highest rate at which the master sends contents to all slaves together, in bytes
-            a second.
+        max_rate: highest rate at which the master receives and sends contents, all together, in
+            bytes a second.
     """
 
     max_size: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 10_000_000_000
-    max_rate: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 50_000_000
+    max_rate: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 25_000_000
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,7 @@ class MasterQueries:
     def __init__(
         self, master: str, state: MasterState, journal: SqliteJournal, plugins: Sequence[PluginRow],
         *, uptime: Callable[[], float], core_now: Callable[[], float], trouble: Callable[[], str],
-        has_artifact: Callable[[str, int], bool],
+        has_artifact: Callable[[str, int], bool] = lambda *_: False,
     ) -> None:  # fmt: skip
         self._master = master
         self._state = state

@@ -43,9 +43,7 @@ class Worker:
     def _started(self) -> queue.SimpleQueue[Callable[[], None]]:
         if self._jobs is None:
             self._jobs = queue.SimpleQueue()
-            threading.Thread(
-                target=_work, args=(self._jobs,), name=self._name, daemon=True
-            ).start()
+            threading.Thread(target=_work, args=(self._jobs,), name=self._name, daemon=True).start()
         return self._jobs
 
 

@@ -234,6 +234,7 @@ class SlaveRuntime:
             config.state / "artifacts", config.artifacts.max_size,
             ArtifactEndpoint(self._endpoints, config.host),
             post=self._post, used=self._state.used_artifacts,
+            has_master=lambda: self._is_registered,
             report=lambda one, reason: self._take(StartDelayed(one, reason)),
         )  # fmt: skip
         duties = Duties(

@@ -1,7 +1,7 @@
 """Services of the master for the contents of artifacts: clients send them, slaves fetch them.
 
-A thread reads and writes the files, so that the loop never waits for the disk. A part goes through
-the loop, and the loop sends at most `max_rate` bytes a second, so that it has time for readings.
+A thread reads and writes the files, so that the loop never waits for the disk. The parts go through
+the loop, at most `max_rate` bytes a second, so that it has time for readings.
 """
 
 from __future__ import annotations
@@ -25,8 +25,9 @@ from rosrm_msgs import srv
 
 #: Most bytes of one part.
 MOST: Final = 256 << 10
-#: Most requests of slaves that wait for the rate.
-_MOST_WAITING: Final = 4096
+#: Seconds of the rate for which requests may wait. It is less than the time-out of a request, so
+#: that no answer comes after the request was sent again.
+_LONGEST_WAIT: Final = 2.0
 _NONE: Final[AbstractSet[str]] = frozenset()
 
 
@@ -36,7 +37,7 @@ class ArtifactServices:
     Args:
         worker: the thread that uses the store.
         keep: returns the digests that processes refer to.
-        max_rate: highest rate of sending, in bytes a second.
+        max_rate: highest rate of receiving and sending together, in bytes a second.
     """
 
     def __init__(
@@ -48,18 +49,14 @@ class ArtifactServices:
         self._keep = keep
         self._rate = max_rate
         self._budget, self._budget_at = max_rate / 10.0, time.monotonic()
-        self._waiting: deque[tuple[Any, SealedRequest]] = deque()
+        #: Bytes and beginning of each part that waits for the rate, and all these bytes.
+        self._waiting: deque[tuple[int, Callable[[], None]]] = deque()
+        self._queued = 0
         path = names.Names(endpoints.participant.settings.namespace)
         endpoints.serve(srv.StoreArtifact, path(names.STORE_ARTIFACT), self._take_part)
         endpoints.serve(srv.ReadArtifact, path(names.READ_ARTIFACT), self._take_read)
 
-    # --- from clients --------------------------------------------------------------------
-
     def _take_part(self, request: srv.StoreArtifact.Request, opened: SealedRequest) -> None:
-        fault = version_refusal(request.protocol_version, "a client")
-        if fault:
-            opened.answer(srv.StoreArtifact.Response(answer=refused("version", fault)))
-            return
         sender = f"{opened.peer.grant.principal} {opened.run.hex()}"
         keep = _NONE if request.data else self._keep()
         take = partial(
@@ -70,40 +67,45 @@ class ArtifactServices:
         def taken(next_offset: int) -> None:
             opened.answer(srv.StoreArtifact.Response(answer=accepted(), next_offset=next_offset))
 
-        self._worker.run(take, taken, partial(_refuse, srv.StoreArtifact, opened))
-
-    # --- to slaves -----------------------------------------------------------------------
+        self._queue(srv.StoreArtifact, request, opened, len(request.data), take, taken)
 
     def _take_read(self, request: srv.ReadArtifact.Request, opened: SealedRequest) -> None:
-        fault = version_refusal(request.protocol_version, "a slave")
-        code = "version"
-        if not fault and len(self._waiting) >= _MOST_WAITING:
-            fault, code = f"{_MOST_WAITING} other requests wait", "busy"
+        most = min(request.max_bytes or MOST, MOST)
+        read = partial(self._store.read, request.digest, request.offset, most)
+
+        def done(part: tuple[int, bytes]) -> None:
+            size, data = part
+            answer = accepted()
+            opened.answer(srv.ReadArtifact.Response(answer=answer, size=size, data=array("B", data)))
+
+        self._queue(srv.ReadArtifact, request, opened, most, read, done)
+
+    def _queue(
+        self, kind: Any, request: Any, opened: SealedRequest, size: int,
+        work: Callable[[], Any], then: Callable[[Any], None],
+    ) -> None:  # fmt: skip
+        """Let the thread do the work of a request as soon as the rate allows its bytes."""
+        fault = version_refusal(request.protocol_version, str(opened.peer.grant.principal))
+        refuse = partial(_refuse, kind, opened)
         if fault:
-            opened.answer(srv.ReadArtifact.Response(answer=refused(code, fault)))
-            return
-        self._waiting.append((request, opened))
-        self.advance(time.monotonic())
+            refuse(Refused(fault, "version"))
+        elif self._queued > _LONGEST_WAIT * self._rate:
+            refuse(Refused("other hosts and clients transfer artifacts", "busy"))
+        else:
+            self._queued += size
+            self._waiting.append((size, partial(self._worker.run, work, then, refuse)))
+            self.advance(time.monotonic())
 
     def advance(self, now: float) -> None:
-        """Read the parts that the rate allows; called several times a second."""
+        """Begin with the parts that the rate allows; called several times a second."""
         most = self._rate / 10.0
         self._budget = min(most, self._budget + self._rate * (now - self._budget_at))
         self._budget_at = now
         while self._waiting and self._budget > 0.0:
-            request, opened = self._waiting.popleft()
-            size = min(request.max_bytes or MOST, MOST)
+            size, begin = self._waiting.popleft()
             self._budget -= size
-            self._worker.run(
-                partial(self._store.read, request.digest, request.offset, size),
-                partial(_send, opened), partial(_refuse, srv.ReadArtifact, opened),
-            )  # fmt: skip
-
-
-def _send(opened: SealedRequest, part: tuple[int, bytes]) -> None:
-    size, data = part
-    response = srv.ReadArtifact.Response(answer=accepted(), size=size, data=array("B", data))
-    opened.answer(response)
+            self._queued -= size
+            begin()
 
 
 def _refuse(kind: Any, opened: SealedRequest, error: Exception) -> None:

@@ -15,7 +15,7 @@ from rosrm.runtime.worker import Worker
 
 #: Seconds for one answer; then the part is requested again.
 _ANSWER: Final = 3.0
-#: Seconds without a new part after which the fetch has failed.
+#: Seconds without a new part, in contact with the master, after which the fetch has failed.
 PATIENCE: Final = 60.0
 #: Most parts that wait for the disk.
 _MOST_WAITING: Final = 4
@@ -29,6 +29,7 @@ class Fetch:
     Args:
         worker: the thread that uses the cache.
         used: the artifacts of all processes here.
+        has_master: returns True while a master has registered this host.
         ended: called once, with the reason of a failure; "": the artifact is here.
 
     Attributes:
@@ -38,13 +39,14 @@ class Fetch:
 
     def __init__(
         self, artifact: Artifact, endpoint: ArtifactEndpoint, cache: ArtifactCache, worker: Worker,
-        *, used: Used, ended: Callable[[str], None],
+        *, used: Used, has_master: Callable[[], bool], ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.artifact = artifact
         self.offset = 0
         self._endpoint = endpoint
         self._cache = cache
         self._worker = worker
+        self._has_master = has_master
         self._ended = ended
         self._has_ended = self._waits = False
         self._writing = 0
@@ -62,17 +64,20 @@ class Fetch:
         """Request the next part, unless an answer or the disk is awaited."""
         if self._has_ended or self._incoming is None or self._is_complete:
             return
+        if not self._has_master():  # it cannot choose another host
+            self._progress_at = now
         if not self._waits and now - self._progress_at >= PATIENCE:
             self._end(
                 f"artifact {self.artifact.name!r} was not fetched: no part of it came from the "
                 f"master within {PATIENCE:g} s ({self._silence})"
             )
-        elif not self._waits and self._writing < _MOST_WAITING:
-            if self._endpoint.finds_master(now):
-                self._waits = True
-                self._endpoint.ask(
-                    self.artifact.digest, self.offset, now + _ANSWER, self._answered
-                )
+        elif self._may_ask and self._endpoint.finds_master(now):
+            self._waits = True
+            self._endpoint.ask(self.artifact.digest, self.offset, now + _ANSWER, self._answered)
+
+    @property
+    def _may_ask(self) -> bool:
+        return not self._waits and self._writing < _MOST_WAITING
 
     @property
     def _is_complete(self) -> bool:
@@ -92,6 +97,7 @@ class Fetch:
             self._silence = "it does not answer"
         elif isinstance(part, Refused) and part.code in _AGAIN:
             self._silence = str(part)
+            self._progress_at = time.monotonic()  # the master is alive
         elif isinstance(part, Refused):
             self._end(f"artifact {self.artifact.name!r} was not fetched: {part}")
         elif part.size != self.artifact.size or not part.data:

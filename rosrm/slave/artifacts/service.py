@@ -36,11 +36,13 @@ class _Preparation:
 
     Attributes:
         missing: artifacts that are not here; None: the cache was not searched yet.
+        fetched: digests of those that were fetched for it.
     """
 
     assignment: Assignment
     done: Done
     missing: list[Artifact] | None = None
+    fetched: set[str] = field(default_factory=set)
     reported_at: float = field(default_factory=time.monotonic)
 
 
@@ -52,13 +54,14 @@ class ArtifactService:
         max_size: most bytes of the cache.
         post: schedules a call in the loop; may be called from any thread.
         used: returns the artifacts of the instances that have not ended.
+        has_master: returns True while a master has registered this host.
         report: reports to the master why an instance does not run yet.
     """
 
     def __init__(
         self, root: Path, max_size: int, endpoint: ArtifactEndpoint, *,
         post: Callable[[Callable[[], None]], None],
-        used: Callable[[], list[tuple[Artifact, ...]]],
+        used: Callable[[], list[tuple[Artifact, ...]]], has_master: Callable[[], bool],
         report: Callable[[InstanceId, str], None],
     ) -> None:  # fmt: skip
         self.root = root
@@ -66,6 +69,7 @@ class ArtifactService:
         self._cache = ArtifactCache(root, max_size)
         self._worker = Worker("artifacts", post)
         self._used = used
+        self._has_master = has_master
         self._report = report
         self._preparing: dict[InstanceId, _Preparation] = {}
         self._fetches: dict[str, Fetch] = {}
@@ -127,11 +131,17 @@ class ArtifactService:
         if waits is None:
             return
         waits.missing = missing
-        if missing:
+        again = [one.name for one in missing if one.digest in waits.fetched]
+        if again:
+            self._finish(instance, f"artifact {again[0]!r} was changed or removed as it arrived")
+        elif missing:
             self._begin_fetches()
-            return
+        else:
+            self._assemble(instance, waits.assignment.spec.artifacts)
+
+    def _assemble(self, instance: InstanceId, artifacts: tuple[Artifact, ...]) -> None:
         self._worker.run(
-            partial(self._cache.assemble, waits.assignment.spec.artifacts),
+            partial(self._cache.assemble, artifacts),
             lambda _: self._finish(instance, ""), partial(self._fail, instance),
         )  # fmt: skip
 
@@ -143,7 +153,7 @@ class ArtifactService:
                 if one.digest not in self._fetches:
                     self._fetches[one.digest] = Fetch(
                         one, self._endpoint, self._cache, self._worker, used=self._used(),
-                        ended=partial(self._fetched, one),
+                        has_master=self._has_master, ended=partial(self._fetched, one),
                     )  # fmt: skip
 
     def _fetched(self, artifact: Artifact, fault: str) -> None:
@@ -155,6 +165,7 @@ class ArtifactService:
             if left == (waits.missing or []):
                 continue
             waits.missing = left
+            waits.fetched.add(artifact.digest)
             if fault:
                 self._finish(instance, fault)
             elif not left:

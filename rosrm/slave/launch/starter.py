@@ -1,4 +1,4 @@
-"""Start of accepted assignments: fetch artifacts and snapshot, start the process, await its node."""
+"""Start of accepted assignments: fetch their files, start the process, await its node."""
 
 from __future__ import annotations
 

@@ -62,9 +62,11 @@ class Host:
         self.used: list[tuple[Artifact, ...]] = []
         self.ended: dict[InstanceId, str] = {}
         self.reports: list[str] = []
+        self.has_master = True
         self.service = ArtifactService(
             root, max_size, self.master, post=self.calls.put, used=lambda: self.used,
             report=lambda _, reason: self.reports.append(reason),
+            has_master=lambda: self.has_master,
         )  # fmt: skip
 
     def prepare(self, number: int, *artifacts: Artifact) -> InstanceId:
@@ -72,8 +74,11 @@ class Host:
         spec = ProcessSpec("p", command=("{artifacts}/x",), artifacts=artifacts)
         self.used.append(artifacts)
         assignment = Assignment(instance, spec, epoch=1, node_name="p")
-        self.service.prepare(assignment, lambda one, fault: self.ended.update({one.instance: fault}))
+        self.service.prepare(assignment, self._done)
         return instance
+
+    def _done(self, assignment: Assignment, fault: str) -> None:
+        self.ended[assignment.instance] = fault
 
     def run_until(self, condition, what: str, now: float | None = None) -> None:
         deadline = time.monotonic() + PATIENCE
@@ -173,6 +178,17 @@ def test_a_silent_master_is_a_refusal_in_time(host, offered, monkeypatch, tmp_pa
     )
     assert host.reports[0] == "fetches artifacts, 0 B of 302 kB"
     host.run_until(lambda: not list((tmp_path / "artifacts/incoming").iterdir()), "removed")
+
+
+def test_a_host_without_a_master_waits(host, offered, monkeypatch):
+    """The fetch continues when the master returns."""
+    monkeypatch.setattr(fetch, "PATIENCE", 0.2)
+    host.has_master, host.master.is_silent = False, True
+    instance = host.prepare(1, offered("model"))
+    later = time.monotonic() + 0.6
+    host.run_until(lambda: time.monotonic() >= later, "some time passes")
+    host.has_master, host.master.is_silent = True, False
+    assert host.outcome(instance) == ""
 
 
 def test_a_stopped_instance_cancels_its_fetch(host, offered, tmp_path):
