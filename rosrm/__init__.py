@@ -122,6 +122,7 @@ if TYPE_CHECKING:
         ResourceName,
         Seconds,
     )
+    from rosrm.model.artifacts import Artifact
     from rosrm.model.devices import Device, DeviceNeed
     from rosrm.model.plan import (
         AwaitReady,
@@ -169,7 +170,8 @@ if TYPE_CHECKING:
 
 # Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
-    "PROTOCOL_VERSION", "Accounting", "Amount", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
+    "PROTOCOL_VERSION", "Accounting", "Amount", "Artifact", "AwaitReady", "AwaitReleased",
+    "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
@@ -210,6 +212,7 @@ _NAMES: Final = {
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
+    "model.artifacts": "Artifact",
     "model.devices": "Device DeviceNeed",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "

@@ -149,7 +149,8 @@ def _scheduling(spec: ProcessSpec) -> dict[str, Any]:
 SPECS: Final = st.builds(
     lambda spec, program: replace(spec, **{**_NO_PROGRAM, **program, **_scheduling(spec)}),
     drawn(
-        ProcessSpec, neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple),
+        ProcessSpec,
+        neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple),
         artifacts=st.lists(_ARTIFACTS, max_size=3, unique_by=lambda one: one.name).map(tuple),
     ),
     _PROGRAMS,

@@ -74,9 +74,8 @@ class ArtifactServices:
         read = partial(self._store.read, request.digest, request.offset, most)
 
         def done(part: tuple[int, bytes]) -> None:
-            size, data = part
-            answer = accepted()
-            opened.answer(srv.ReadArtifact.Response(answer=answer, size=size, data=array("B", data)))
+            answer, data = accepted(), array("B", part[1])
+            opened.answer(srv.ReadArtifact.Response(answer=answer, size=part[0], data=data))
 
         self._queue(srv.ReadArtifact, request, opened, most, read, done)
 
