@@ -46,6 +46,7 @@ def unpack(archive: Path, directory: Path) -> None:
     import tarfile  # noqa: PLC0415 - the slave, whose memory is budgeted, seldom needs it
 
     directory.mkdir(mode=0o700)
+    left = archive.stat().st_size
     links: list[TarInfo] = []
     directories: list[str] = []
     try:
@@ -54,6 +55,9 @@ def unpack(archive: Path, directory: Path) -> None:
                 if count > MOST_ENTRIES:
                     raise TransferError(f"it has more than {MOST_ENTRIES} entries")
                 _check(entry)
+                left -= entry.size
+                if left < 0:  # a sparse file would fill the disk
+                    raise TransferError("its contents are larger than the archive")
                 path = directory / entry.name
                 if entry.issym():
                     links.append(entry)

@@ -117,7 +117,7 @@ def test_what_a_process_uses_stays(cache, root, offered):
 
 
 def test_an_artifact_larger_than_the_cache_is_refused(cache, root, offered):
-    """The others are not removed in vain."""
+    """The others stay."""
     fetch(cache, *offered("a"))
     with pytest.raises(Refused, match=r"artifact 'big' has 2.0 MB.*artifacts.max_size"):
         cache.begin(offered("big", 2_000_000)[0], [])

@@ -65,7 +65,7 @@ def test_equal_contents_are_sent_once(big):
 
 
 def test_a_restarted_master_gets_the_contents_from_the_beginning(big):
-    """What it had received before is lost."""
+    """The parts that it had received before are lost."""
     master = Master(restarts_at=256 << 10)
     send_artifacts(master, [spec("a", big)], no_note)
     assert len(master.stored) == 1
