@@ -118,7 +118,7 @@ class MasterServices:
         offer(srv.RegisterHost, path(names.REGISTER_HOST), self._take_registration)
         for kind, name, event in (
             (srv.Leave, names.LEAVE, self._left),
-            (srv.Submit, names.SUBMIT, self._submitted),
+            (srv.Submit, names.SUBMIT, self._submission),
             (srv.Cancel, names.CANCEL, _cancelled),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
@@ -175,9 +175,10 @@ class MasterServices:
             response.host = reply.host
         return response
 
-    def _submitted(self, request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
-        specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
-        for spec in specs:
+    def _submission(self, request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
+        """Return the event of a submission whose artifacts are stored; raises `Refused`."""
+        event = _submitted(request, token, peer)
+        for spec in event.specs:
             for one in spec.artifacts:
                 if not self._queries.has_artifact(one.digest, one.size):
                     raise Refused(
@@ -185,7 +186,7 @@ class MasterServices:
                         f"{one.name!r}; nothing was queued: submit again",
                         "unknown",
                     )
-        return happened.SubmissionReceived(token, specs, _requester(peer))
+        return event
 
     # --- slaves --------------------------------------------------------------------------
 
@@ -374,6 +375,11 @@ def _check_name(slave: Peer, name: str) -> None:
             f"{own} may not register as {name!r}: a slave registers only the host of its key",
             "denied",
         )
+
+
+def _submitted(request: srv.Submit.Request, token: int, peer: Peer) -> happened.SubmissionReceived:
+    specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
+    return happened.SubmissionReceived(token, specs, _requester(peer))
 
 
 def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:

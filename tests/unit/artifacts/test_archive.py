@@ -168,12 +168,12 @@ def test_an_archive_with_a_forbidden_entry_is_refused(entries, says, tar, tmp_pa
     assert outside == {"any.tar", "new"}
 
 
-def test_an_archive_that_unpacks_to_more_than_its_size_is_refused(tar, tmp_path):
-    """A sparse file of an exabyte is a short archive."""
+def test_a_sparse_file_is_refused(tar, tmp_path):
+    """A short archive could fill the disk."""
     path = tar(entry("content", size=3))
-    header = entry("content", tarfile.GNUTYPE_SPARSE, size=10**15).tobuf(tarfile.GNU_FORMAT)
+    header = entry("content", tarfile.GNUTYPE_SPARSE).tobuf(tarfile.GNU_FORMAT)
     path.write_bytes(header + bytes(2048))
-    with pytest.raises(TransferError, match=r"larger than the archive|no sound archive"):
+    with pytest.raises(TransferError, match="neither a file"):
         unpack(path, tmp_path / "new")
 
 
