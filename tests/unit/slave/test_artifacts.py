@@ -9,10 +9,19 @@ from dataclasses import replace
 import pytest
 
 from rosrm.artifacts.pack import Archive
+from rosrm.core.slave import reducer
+from rosrm.core.slave.events import SupervisorReplaced, SupervisorReported
+from rosrm.core.slave.state import SlaveState
 from rosrm.core.slave.watches import Memo
 from rosrm.errors import Refused
 from rosrm.model.artifacts import Artifact
-from rosrm.model.values import Assignment, InstanceId, ProcessSpec
+from rosrm.model.values import (
+    Assignment,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ProcessSpec,
+)
 from rosrm.ros.slave.artifacts import ArtifactPart
 from rosrm.slave.artifacts import fetch
 from rosrm.slave.artifacts.service import ArtifactService
@@ -208,3 +217,10 @@ def test_a_later_run_of_the_slave_knows_the_artifacts_in_use():
     """The supervisor keeps them with the instance."""
     memo = Memo(artifacts=(Artifact("x", "0" * 64, 5),))
     assert from_memo(to_memo(memo)) == memo
+    state, instance = SlaveState(), InstanceId("p", 1)
+    running = InstanceStatus(instance, InstanceState.RUNNING, pid=5)
+    reducer.step(state, SupervisorReplaced((running,), {instance: memo}), 0.0)
+    assert state.used_artifacts() == [memo.artifacts]
+    ended = replace(running, state=InstanceState.EXITED)
+    reducer.step(state, SupervisorReported((ended,)), 1.0)
+    assert state.used_artifacts() == []
