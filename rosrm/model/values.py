@@ -333,7 +333,7 @@ class ProcessSpec:
 
     @property
     def fetch_time(self) -> float:
-        """Return the seconds that a move adds to the time-out of a start, for its artifacts."""
+        """Return the seconds that a move adds to the time-out of a start, for the artifacts."""
         return fetch_time(self.artifacts)
 
     @property

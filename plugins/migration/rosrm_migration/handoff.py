@@ -170,8 +170,8 @@ def _as_in_the_paper(move: Move, options: HandoffOptions) -> Plan:
 def _start(move: Move, options: HandoffOptions) -> Start:
     stop = Stop(move.destination, move.destination_host, move.spec.stop.timeout)
     return Start(
-        move.destination, move.destination_host, options.start_timeout + move.spec.fetch_time,
-        alias_of(move), undo=stop, shadow=True, remappings=_own_names(move.spec, options),
+        move.destination, move.destination_host, options.start_timeout, alias_of(move), undo=stop,
+        shadow=True, remappings=_own_names(move.spec, options),
     )  # fmt: skip
 
 

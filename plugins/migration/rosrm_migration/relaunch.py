@@ -37,7 +37,7 @@ class Relaunch:
         """Return the plan: start, await ready, commit, stop the source; or with the stop first."""
         if move.spec.migration.overlap:
             return _start_first(move, move.options)
-        return _stop_first(move, move.options.start_timeout + move.spec.fetch_time)
+        return _stop_first(move, move.options.start_timeout)
 
 
 def _start_first(move: Move, options: RelaunchOptions) -> Plan:
@@ -46,8 +46,7 @@ def _start_first(move: Move, options: RelaunchOptions) -> Plan:
     return Plan(
         (
             Start(
-                move.destination, move.destination_host,
-                options.start_timeout + move.spec.fetch_time,
+                move.destination, move.destination_host, options.start_timeout,
                 undo=_stop_destination(move),
             ),
             AwaitReady(move.destination, move.destination_host, ready, settle=settle),
