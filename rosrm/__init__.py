@@ -25,7 +25,7 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
                 HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
-                ReschedulePolicy, StartOrder, GroupMembership, ArrayMembership, Schedule
+                Artifact, ReschedulePolicy, StartOrder, GroupMembership, ArrayMembership, Schedule
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device
@@ -123,6 +123,7 @@ if TYPE_CHECKING:
         Seconds,
     )
     from rosrm.model.arrays import ArrayMembership
+    from rosrm.model.artifacts import Artifact
     from rosrm.model.devices import Device, DeviceNeed
     from rosrm.model.plan import (
         AwaitReady,
@@ -173,8 +174,9 @@ if TYPE_CHECKING:
 
 # Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
-    "PROTOCOL_VERSION", "Accounting", "Amount", "ArrayMembership", "AwaitReady", "AwaitReleased",
-    "BoolArray", "Bytes", "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
+    "PROTOCOL_VERSION", "Accounting", "Amount", "ArrayMembership", "Artifact", "AwaitReady",
+    "AwaitReleased", "BoolArray", "Bytes",
+    "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
     "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
     "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
     "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
@@ -216,6 +218,7 @@ _NAMES: Final = {
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
     "model.arrays": "ArrayMembership",
+    "model.artifacts": "Artifact",
     "model.devices": "Device DeviceNeed",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "

@@ -10,6 +10,7 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 from hypothesis import strategies as st
 
 from rosrm.model.arrays import NO_ARRAY
+from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
@@ -166,6 +167,11 @@ _NEIGHBOURS: Final = st.one_of(
     drawn(NeighbourRule, group=NAMES, processes=st.just(())),
 )  # fmt: skip
 
+_ARTIFACTS: Final = drawn(
+    Artifact, name=PROPER_NAMES, digest=st.text("0123456789abcdef", min_size=64, max_size=64),
+    size=st.integers(1, 10**13), source=st.just(""),
+)  # fmt: skip
+
 
 def _scheduling(spec: ProcessSpec) -> dict[str, Any]:
     """Return the real-time scheduling of a spec without the settings that contradict it."""
@@ -187,6 +193,10 @@ SPECS: Final = st.builds(
     lambda spec, program: replace(
         spec, **{**_NO_PROGRAM, **program, **_scheduling(spec), **_for_jobs(spec)}
     ),
-    drawn(ProcessSpec, neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple)),
+    drawn(
+        ProcessSpec,
+        neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple),
+        artifacts=st.lists(_ARTIFACTS, max_size=3, unique_by=lambda one: one.name).map(tuple),
+    ),
     _PROGRAMS,
 )

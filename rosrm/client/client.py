@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
@@ -89,9 +90,18 @@ class Client:
                 and so on), a `ProcessSpec`, or several of these.
 
         Raises:
-            ConfigError: a file or a mapping is invalid; nothing was sent.
+            ConfigError: a file or a mapping is invalid, or an artifact cannot be read; nothing was
+                queued.
         """
-        return self._master.submit(_specs(work))
+        return self._master.submit(self._sent(_specs(work)))
+
+    def _sent(self, specs: Sequence[ProcessSpec]) -> Sequence[ProcessSpec]:
+        """Send the contents of artifacts to the master; return the specs with the digests."""
+        if not any(one.source for spec in specs for one in spec.artifacts):
+            return specs
+        from rosrm.client.artifacts import send_artifacts  # noqa: PLC0415 - only for artifacts
+
+        return send_artifacts(self._master, specs, self._notify)
 
     def apply(self, work: Path | Iterable[Path], *, plan_only: bool = False) -> ApplyResult:
         """Make applications as their work files describe them, all or none.
@@ -111,7 +121,8 @@ class Client:
 
     def apply_targets(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
         """Make applications as their targets describe them, all or none; see `apply`."""
-        return self._master.apply(targets, plan_only=plan_only)
+        sent = [replace(one, specs=tuple(self._sent(one.specs))) for one in targets]
+        return self._master.apply(sent, plan_only=plan_only)
 
     def revert(self, application: str, version: int, *, plan_only: bool = False) -> ApplyResult:
         """Make an earlier version of an application the desired one again.

@@ -23,6 +23,7 @@ from rosrm.extensions.units import (
     Seconds,
 )
 from rosrm.model.arrays import INDEX_PLACEHOLDER, ArrayMembership
+from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER, artifacts_fault, artifacts_of
 from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import is_namespace, name_fault, other_process_fault
 from rosrm.model.devices import need_fault, unknown_placeholders
@@ -266,6 +267,7 @@ class ProcessInFile:
         default_factory=lambda: EMPTY
     )
     container: ContainerInFile | None = None
+    artifacts: Annotated[Mapping[str, Text], NullIsEmpty()] = field(default_factory=lambda: EMPTY)
 
     def spec(self) -> ProcessSpec:
         """Return the process as the spec that the core uses.
@@ -300,6 +302,7 @@ class ProcessInFile:
             group=GroupMembership(),  # of the file as a whole
             secrets={name: secret.file for name, secret in self.secrets.items()},
             container=Container() if self.container is None else _same(Container, self.container),
+            artifacts=artifacts_of(self.artifacts),
             given=(),
         )
 
@@ -464,6 +467,19 @@ def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
             )
 
 
+def _about_artifacts(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = artifacts_fault(spec.artifacts)
+    if fault:
+        yield Complaint(("artifacts",), f"artifacts: {fault}")
+    for one in spec.artifacts:
+        if not one.source:
+            yield Complaint(("artifacts", one.name), f"artifacts.{one.name}: a path is required")
+    for key in _WITH_PLACEHOLDER if not spec.artifacts else ():
+        if ARTIFACTS_PLACEHOLDER in repr(getattr(spec, key)):
+            text = f"{key}: {ARTIFACTS_PLACEHOLDER} needs `artifacts:` in the process"
+            yield Complaint((key,), text)
+
+
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
     for name in spec.talks_to:
         fault = other_process_fault(name, spec.name)
@@ -581,6 +597,10 @@ def _fault_of_parameter(value: Any) -> str:
 
 _Rule = Callable[[ProcessSpec], Iterator[Complaint]]
 _PROGRAM: Final = ("package", "executable", "module", "command")
+#: Fields in which `{artifacts}` stands for the directory of the artifacts.
+_WITH_PLACEHOLDER: Final = (
+    "command", "arguments", "parameters", "environment", "working_directory",
+)  # fmt: skip
 #: Each rule with the keys that it reads.
 _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
@@ -596,6 +616,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_start_order, ("name", "after")),
     (_about_devices, ("devices", "arguments", "parameters")),
+    (_about_artifacts, ("artifacts", *_WITH_PLACEHOLDER)),
     (_about_flows, ("name", "talks_to")),
     (_about_gang, ("together",)),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),

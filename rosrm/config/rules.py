@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rosrm.config.documents import Node, Place, Problems
 from rosrm.extensions.units import ANY_AMOUNT, amount_of
+from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER
 from rosrm.model.description_checks import name_fault
 
 
@@ -71,6 +72,8 @@ def settled_on_host(path: str, file: str | Path) -> str:
     """Return a path for the host that runs a process.
 
     A relative path is joined to the file's directory. `~` stays for the slave, because the home of
-    its user may differ there.
+    its user may differ there, and so does `{artifacts}`.
     """
-    return path if path.startswith("~") else os.path.normpath(Path(file).absolute().parent / path)
+    if path.startswith(("~", ARTIFACTS_PLACEHOLDER)):
+        return path
+    return os.path.normpath(Path(file).absolute().parent / path)

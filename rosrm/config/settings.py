@@ -273,6 +273,20 @@ class JournalSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ArtifactStoreSettings:
+    """Contents of artifacts at the master, from which slaves fetch them.
+
+    Attributes:
+        max_size: most bytes of all contents together.
+        max_rate: highest rate at which the master receives and sends contents, all together, in
+            bytes a second.
+    """
+
+    max_size: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 10_000_000_000
+    max_rate: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 25_000_000
+
+
+@dataclass(frozen=True, slots=True)
 class RecordSettings:
     """Recording of a master's run, for `rosrm simulate`.
 
@@ -309,6 +323,7 @@ class ClusterConfig:
         network: measurement of links and flows.
         journal: journal of events and intents.
         record: recording of all events that the master receives, for replay.
+        artifacts: contents of artifacts, which slaves fetch from the master.
         checkpoint: policy that places replicas of snapshots on other hosts, if any.
         delivery_timeout: seconds within which a slave must accept an assignment.
         max_hosts: most hosts, also of those that left or are lost; more are refused.
@@ -334,6 +349,7 @@ class ClusterConfig:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
+    artifacts: ArtifactStoreSettings = field(default_factory=ArtifactStoreSettings)
     checkpoint: CheckpointPolicySettings = field(default_factory=CheckpointPolicySettings)
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout
     max_hosts: PositiveCount = _CORE.max_hosts
@@ -427,6 +443,17 @@ class KeepSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ArtifactCacheSettings:
+    """Artifacts of processes on this host.
+
+    Attributes:
+        max_size: most bytes of all artifacts; beyond, those that were used longest ago are removed.
+    """
+
+    max_size: Annotated[int, Quantity("size", low=1_000_000, whole=True)] = 2_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
 class LinkSettings:
     """Links of this host to other hosts.
 
@@ -480,6 +507,7 @@ class HostConfig:
         control: times of requests.
         keep: snapshots and replicas.
         links: links to other hosts.
+        artifacts: cache of the artifacts of processes.
         on_stop: "stop": a slave that is stopped stops its processes; "keep": it leaves them running
             under the supervisor.
     """
@@ -503,6 +531,7 @@ class HostConfig:
     control: HostControlSettings = field(default_factory=HostControlSettings)
     keep: KeepSettings = field(default_factory=KeepSettings)
     links: LinkSettings = field(default_factory=LinkSettings)
+    artifacts: ArtifactCacheSettings = field(default_factory=ArtifactCacheSettings)
     on_stop: Literal["stop", "keep"] = "stop"
     devices: OfferedByKind = field(default_factory=lambda: EMPTY)
 

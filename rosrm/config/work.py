@@ -7,6 +7,7 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm.artifacts.pack import source_fault
 from rosrm.config.checking import described, near, salvaged, validated
 from rosrm.config.documents import Node, Place, Problems, node_of, read
 from rosrm.config.foreach import expanded
@@ -16,7 +17,13 @@ from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile, about_retries, complaints
 from rosrm.config.rollout import RolloutInFile
-from rosrm.config.rules import check_amounts, check_name, refuse_namesakes, settled_on_host
+from rosrm.config.rules import (
+    check_amounts,
+    check_name,
+    refuse_namesakes,
+    settled,
+    settled_on_host,
+)
 from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
 from rosrm.model.applications import RolloutPolicy, Target
@@ -30,19 +37,22 @@ _NOT_IN_DEFAULTS: Final = ("name", "foreach", "array", "parallel")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
 _NOT_IN_CLUSTER_DEFAULTS: Final = (
     *_NOT_IN_DEFAULTS, *IDENTITY, "near", "apart", "spread", "talks_to", "after", "together",
-    "retries", "every", "at", "on",
+    "artifacts", "retries", "every", "at", "on",
 )  # fmt: skip
 
 
-def load_work(path: str | Path, registry: Registry | None = None) -> tuple[ProcessSpec, ...]:
+def load_work(
+    path: str | Path, registry: Registry | None = None, *, check_artifacts: bool = True
+) -> tuple[ProcessSpec, ...]:
     """Read the processes of a file; raises one `ConfigError` with all problems.
 
     Args:
         path: path of the file.
         registry: the installed plugins, for a check of the migration strategies; None: only the
             master checks them.
+        check_artifacts: False: the files of `artifacts` need not exist.
     """
-    return checked_work(read(path), path, registry).specs
+    return checked_work(read(path), path, registry, check_artifacts=check_artifacts).specs
 
 
 def load_application(path: str | Path, registry: Registry | None = None) -> Target:
@@ -74,7 +84,9 @@ def processes_of(work: Mapping[str, Any]) -> tuple[ProcessSpec, ...]:
     return checked_work(node_of({"processes": [work]}, place), "work", None).specs
 
 
-def checked_work(root: Node, path: str | Path, registry: Registry | None) -> Target:
+def checked_work(
+    root: Node, path: str | Path, registry: Registry | None, *, check_artifacts: bool = True
+) -> Target:
     """Return the processes of a parsed document, and its application; otherwise as `load_work`."""
     problems = Problems()
     check_kind(root, "work")
@@ -91,6 +103,8 @@ def checked_work(root: Node, path: str | Path, registry: Registry | None) -> Tar
     _refuse_circle(nodes, specs, problems)
     refuse_namesakes(nodes, "process", problems)
     members = grouped([spec for spec in specs if spec is not None], root, problems)
+    if check_artifacts:
+        _check_sources(nodes, specs, problems)
     problems.raise_any()
     parts = tuple(replace(spec, application=application) for spec in members)
     return Target(application, parts, rollout=rollout)
@@ -227,6 +241,20 @@ def _refuse_circle(
         problems.add(known[circle[0]].deepest(("after", circle[1])).place, circle_fault(circle))
 
 
+def _check_sources(
+    nodes: Sequence[Node], specs: Sequence[ProcessSpec | None], problems: Problems
+) -> None:
+    """Note the artifacts that are no files or directories, each path once."""
+    checked: set[str] = set()
+    for node, spec in zip(nodes, specs, strict=True):
+        for one in spec.artifacts if spec is not None else ():
+            fault = source_fault(one.source) if one.source and one.source not in checked else ""
+            checked.add(one.source)
+            if fault:
+                place = node.deepest(("artifacts", one.name)).place
+                problems.add(place, f"artifacts.{one.name}: {fault}")
+
+
 def _given(node: Node, value: Any, before: str = "") -> Iterator[str]:
     """Yield the paths of the keys in an entry: of each field, and of each field of a policy."""
     for name, inner in node.items.items():
@@ -255,10 +283,14 @@ def _options_of_strategy(node: Node, plugins: PluginCheck) -> Mapping[str, Any] 
 
 
 def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:
-    """Return the spec with its program and directory resolved by `settled_on_host`."""
+    """Return the spec with its program, directory and artifacts resolved against the file."""
     directory, command = spec.working_directory, spec.command
     if directory:
         spec = replace(spec, working_directory=settled_on_host(directory, path))
     if command and "/" in command[0]:
         spec = replace(spec, command=(settled_on_host(command[0], path), *command[1:]))
-    return spec
+    here = (
+        replace(one, source=str(settled(Path(one.source), path))) if one.source else one
+        for one in spec.artifacts
+    )
+    return replace(spec, artifacts=tuple(here))

@@ -115,6 +115,8 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "register_host": _HOSTS,
     "leave": _HOSTS,
     "request_process": _HOSTS,
+    "store_artifact": _SUBMITTERS,
+    "read_artifact": _HOSTS,
     # Services of slaves:
     "control": _MASTERS,
     "read_log": _BEARERS,

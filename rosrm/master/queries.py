@@ -35,12 +35,14 @@ class MasterQueries:
         plugins: rows of `rosrm plugins` for the master's own plugins.
         uptime: returns the seconds since the master's start.
         core_now: returns the time of the core's clock.
+        has_artifact: returns True if the contents with a digest and a size are stored.
         trouble: returns the reason why the master accepts no new work; "" if it accepts work.
     """
 
     def __init__(
         self, master: str, state: MasterState, journal: SqliteJournal, plugins: Sequence[PluginRow],
         *, uptime: Callable[[], float], core_now: Callable[[], float], trouble: Callable[[], str],
+        has_artifact: Callable[[str, int], bool] = lambda *_: False,
     ) -> None:  # fmt: skip
         self._master = master
         self._state = state
@@ -49,6 +51,7 @@ class MasterQueries:
         self._uptime = uptime
         self._core_now = core_now
         self._trouble = trouble
+        self.has_artifact = has_artifact
 
     def snapshot(self, request: Any, by: Requester) -> Listing:
         """Return the requested listings, as far as the requester may read them."""

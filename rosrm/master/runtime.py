@@ -10,10 +10,12 @@ import os
 import signal
 import socket
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from rosrm.artifacts.store import ArtifactStore
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
@@ -49,6 +51,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
+from rosrm.ros.master.artifacts import ArtifactServices
 from rosrm.ros.master.endpoint import MasterEndpoint
 from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.master_connection import find_master
@@ -56,6 +59,7 @@ from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.runtime.bootstrap import handle_signals
 from rosrm.runtime.state_lock import only_one
+from rosrm.runtime.worker import Worker
 from rosrm.version import __version__
 from rosrm.wording import counted, listed, one_line
 
@@ -130,6 +134,7 @@ class MasterRuntime:
         self._recorder: Recorder | None = None
         self._held: JournalStall | None = None
         self._deadlines = Deadlines()
+        self._from_threads: deque[Callable[[], None]] = deque()
         self._behind = 0.0  # seconds that the core's clock is behind, after blocked time
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -232,17 +237,37 @@ class MasterRuntime:
             self._config.name, socket.gethostname(), os.getpid(), self._state.epoch,
             int.from_bytes(os.urandom(7), "big") | 1,
         )  # fmt: skip
-        control = self._config.control
+        control, artifacts = self._config.control, self._config.artifacts
+        store = ArtifactStore(self._config.state / "artifacts", artifacts.max_size)
+        self._artifacts = ArtifactServices(
+            self._endpoints, store, Worker("artifacts", self._post),
+            keep=self._used_artifacts, max_rate=artifacts.max_rate,
+        )  # fmt: skip
         reading = MasterQueries(
             self._config.name, self._state, self._journal, self._plugins,
             uptime=lambda: self._now() - self._started,
             core_now=lambda: self._core_now(self._now()),
             trouble=lambda: self._held.refusal if self._held is not None else "",
+            has_artifact=store.has,
         )  # fmt: skip
         return MasterEndpoint(self._endpoints, identity, reading, control)
 
     def _now(self) -> float:
         return time.monotonic()
+
+    def _used_artifacts(self) -> frozenset[str]:
+        """Return the digests of the artifacts of all processes and kept versions."""
+        applications = self._state.applications.values()
+        kept = [one for known in applications for one in known.versions.values()]
+        specs = [known.spec for known in self._state.processes.values()]
+        specs += [spec for version in kept for spec in version.specs.values()]
+        return frozenset(one.digest for spec in specs for one in spec.artifacts)
+
+    def _post(self, call: Callable[[], None]) -> None:
+        """Schedule a call in the loop; may be called from any thread."""
+        self._from_threads.append(call)
+        with contextlib.suppress(Exception):  # the participant may be closed already
+            self._participant.wake()
 
     # --- the loop ------------------------------------------------------------------------
 
@@ -256,6 +281,8 @@ class MasterRuntime:
         with self._closing:
             while not self._stopping:
                 self._participant.spin(max(0.0, next_tick - self._now()))
+                while self._from_threads:
+                    self._participant.guard.call(self._from_threads.popleft())
                 now = self._now()
                 if now >= next_tick:
                     next_tick = now + _TICK
@@ -289,6 +316,7 @@ class MasterRuntime:
             self._endpoint.shut_revoked()
         self._endpoint.poll_readings()
         self._endpoint.links.expire(now)
+        self._artifacts.advance(now)
         self._endpoint.events.append(happened.TimePassed())
         self._endpoint.rivals.expire(now)
         rival = self._endpoint.rivals.take_found()

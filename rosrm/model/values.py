@@ -13,6 +13,7 @@ from types import MappingProxyType
 from typing import Any, Final, Literal
 
 from rosrm.model.arrays import NO_ARRAY, ArrayMembership
+from rosrm.model.artifacts import Artifact, fetch_time
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.schedules import NO_SCHEDULE, Schedule
 
@@ -330,6 +331,7 @@ class ProcessSpec:
         secrets: variable to the absolute path of a file on its host; each start sets the variable
             to the content of the file.
         container: container in which it runs.
+        artifacts: files and directories that it gets on its host, in the order of their names.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
     """
@@ -378,6 +380,7 @@ class ProcessSpec:
     together: str = ""
     secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     container: Container = Container()
+    artifacts: tuple[Artifact, ...] = ()
     given: tuple[str, ...] = field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -393,6 +396,11 @@ class ProcessSpec:
             "limits.cpu": self.limits.cpu, "realtime": self.realtime.policy, "nice": self.nice < 0,
         }  # fmt: skip
         return tuple(name for name, value in settings.items() if value)
+
+    @property
+    def fetch_time(self) -> float:
+        """Return the seconds that a move adds to the time-out of a start, for the artifacts."""
+        return fetch_time(self.artifacts)
 
     @property
     def program(self) -> str:

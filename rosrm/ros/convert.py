@@ -14,6 +14,7 @@ from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
 from rosrm.model.applications import OnFailure, RolloutPolicy, Target
+from rosrm.model.artifacts import Artifact, artifacts_fault, contents_fault
 from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import (
     description_fault,
@@ -176,6 +177,9 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
         talks_to=[
             msg.ProcessFlow(process=name, rate=float(rate)) for name, rate in spec.talks_to.items()
         ],
+        artifacts=[
+            msg.Artifact(name=one.name, digest=one.digest, size=one.size) for one in spec.artifacts
+        ],
     )  # fmt: skip
 
 
@@ -196,6 +200,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
             options=json_object(message.migration.options, "migration options"),
         ),
         talks_to={flow.process: flow.rate for flow in message.talks_to},
+        artifacts=_artifacts(message),
     )  # fmt: skip
     fault = limits_fault(spec) or job_fault(spec) or secrets_fault(spec) or container_fault(spec)
     if fault:
@@ -213,12 +218,16 @@ def target_to_msg(target: Target) -> msg.ApplicationTarget:
     )  # fmt: skip
 
 
-def target_from_msg(message: msg.ApplicationTarget) -> Target:
-    """Return the inverse of `target_to_msg`; raises `Refused` for an invalid target."""
+def target_from_msg(
+    message: msg.ApplicationTarget, specs: tuple[values.ProcessSpec, ...]
+) -> Target:
+    """Return the inverse of `target_to_msg`; raises `Refused` for an invalid target.
+
+    `specs`: its processes.
+    """
     fault = name_fault(message.application, "application") or _rollout_fault(message)
     if fault:
         raise Refused(fault)
-    specs = tuple(spec_from_msg(spec) for spec in message.processes)
     rollout = RolloutPolicy(message.max_parallel, message.healthy_for, message.on_failure)
     return Target(message.application, specs, message.version, rollout)
 
@@ -254,6 +263,7 @@ def _spec_fault(message: msg.ProcessSpec) -> str:
         or _flows_fault(message)
         or _start_order_fault(message)
         or _names_fault(message)
+        or _artifacts_fault(message)
     )
 
 
@@ -306,6 +316,16 @@ def _neighbours_fault(message: msg.ProcessSpec) -> str:
 def _devices_fault(message: msg.ProcessSpec) -> str:
     fault = need_fault(_from_msg(DeviceNeed, need) for need in message.devices)
     return f"devices: {fault}" if fault else ""
+
+
+def _artifacts(message: msg.ProcessSpec) -> tuple[Artifact, ...]:
+    return tuple(Artifact(one.name, one.digest, one.size) for one in message.artifacts)
+
+
+def _artifacts_fault(message: msg.ProcessSpec) -> str:
+    artifacts = _artifacts(message)
+    fault = artifacts_fault(artifacts) or contents_fault(artifacts)
+    return f"artifacts: {fault}" if fault else ""
 
 
 def _held(message: msg.Assignment | msg.ProcessStatus) -> tuple[HeldDevice, ...]:

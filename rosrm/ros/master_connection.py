@@ -6,6 +6,7 @@ import json
 import math
 import os
 import time
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, Literal
@@ -278,6 +279,23 @@ class MasterClient:
         )  # fmt: skip
         actions = from_plain(tuple[PlannedAction, ...], json.loads(answer.actions))
         return ApplyResult(str(answer.answer.message), actions)
+
+    def store_artifact(self, digest: str, size: int, offset: int, data: bytes = b"") -> int:
+        """Send a part of an artifact, and return the offset of the part that the master expects.
+
+        Without data the request only asks for this offset, and makes room for the artifact.
+
+        Args:
+            digest: SHA-256 of the archive in hexadecimal digits.
+            size: bytes of the archive; as a result: all of them have arrived.
+            offset: of the first byte of the part.
+        """
+        request = srv.StoreArtifact.Request(
+            protocol_version=PROTOCOL_VERSION, digest=digest, size=size, offset=offset,
+            data=array("B", data),
+        )  # fmt: skip
+        answer = self._call(srv.StoreArtifact, names.STORE_ARTIFACT, request)
+        return int(answer.next_offset)
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""

@@ -83,6 +83,8 @@ CONTROL: Final = "control"
 READ_LOG: Final = "read_log"
 STORE_REPLICA: Final = "store_replica"
 READ_SNAPSHOT: Final = "read_snapshot"
+STORE_ARTIFACT: Final = "store_artifact"
+READ_ARTIFACT: Final = "read_artifact"
 
 RESOURCE_INFO: Final = "resource_info"
 PROCESS_STATUS: Final = "process_status"

@@ -13,9 +13,10 @@ def to_memo(memo: Memo) -> str:
     """Return a memo as text, its parts as lists of their fields; "" if it is empty."""
     if memo == Memo():
         return ""
-    awaited, watch, devices = astuple(memo)
+    awaited, watch, devices, artifacts = astuple(memo)
     plain = {"awaited": awaited, "watch": watch}
-    return json.dumps({**plain, "devices": devices} if devices else plain)
+    given = {"devices": devices, "artifacts": artifacts}
+    return json.dumps({**plain, **{name: value for name, value in given.items() if value}})
 
 
 def from_memo(text: str) -> Memo | None:

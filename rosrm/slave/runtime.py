@@ -20,7 +20,7 @@ import numpy as np
 from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
-from rosrm.core.slave.events import DevicesMissed, Event, Registered, TimePassed
+from rosrm.core.slave.events import DevicesMissed, Event, Registered, StartDelayed, TimePassed
 from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
@@ -42,6 +42,7 @@ from rosrm.model.values import (
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
+from rosrm.ros.slave.artifacts import ArtifactEndpoint
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.flows import FlowSampler
 from rosrm.ros.slave.graph import GraphWatch
@@ -51,6 +52,7 @@ from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveSer
 from rosrm.runtime.bootstrap import handle_signals
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
+from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.devices import LOOK_PERIOD as LOOK_AT_DEVICES
 from rosrm.slave.devices import DeviceWatch
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
@@ -161,7 +163,7 @@ class SlaveRuntime:
             self._serve_master(max_age)
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
-                self._replication, graph, sessions, launchers, take=self._take,
+                self._replication, self._artifacts, graph, sessions, launchers, take=self._take,
                 instance_key=lambda one: security.instance_key(one.process, one.number),
             )  # fmt: skip
             self._ending = Shutdown(
@@ -228,6 +230,13 @@ class SlaveRuntime:
             self._snapshots, config.host, config.keep,
             ReplicationEndpoint(self._endpoints, config.host),
             post=self._post, publish=self._endpoint.publish_snapshots,
+        )  # fmt: skip
+        self._artifacts = ArtifactService(
+            config.state / "artifacts", config.artifacts.max_size,
+            ArtifactEndpoint(self._endpoints, config.host),
+            post=self._post, used=self._state.used_artifacts,
+            has_master=lambda: self._is_registered,
+            report=lambda one, reason: self._take(StartDelayed(one, reason)),
         )  # fmt: skip
         duties = Duties(
             self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
@@ -398,6 +407,7 @@ class SlaveRuntime:
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
+        self._artifacts.tick(now)
         self._look_at_flows()
         sample = self._sampler.latest(now)
         if sample.reports:

@@ -134,7 +134,7 @@ def _is_file(word: str) -> bool:
 def _names_in(file: str) -> list[str]:
     from rosrm.config.work import load_work
 
-    return [spec.name for spec in load_work(file)]
+    return [spec.name for spec in load_work(file, check_artifacts=False)]
 
 
 def restart(

@@ -47,6 +47,14 @@ class LaunchRefused:
 
 
 @dataclass(frozen=True, slots=True)
+class StartDelayed:
+    """The start of an instance waits for something that is being fetched."""
+
+    instance: InstanceId
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class StopOrdered:
     """The master ordered to stop an instance for good."""
 
@@ -162,6 +170,7 @@ Event = (
     | MasterLost
     | AssignmentsReceived
     | LaunchRefused
+    | StartDelayed
     | StopOrdered
     | FenceOrdered
     | ContactConfirmed

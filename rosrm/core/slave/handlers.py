@@ -96,8 +96,9 @@ def _waiting(assignment: Assignment) -> HeldInstance:
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
     watch, fenced = watch_of(assignment), assignment.fence is not None
     return HeldInstance(
-        status, spec, awaited, watch=watch, fenced=fenced, devices=assignment.devices
-    )
+        status, spec, awaited, watch=watch, fenced=fenced, devices=assignment.devices,
+        artifacts=spec.artifacts,
+    )  # fmt: skip
 
 
 def _start_waiting(state: SlaveState, now: float) -> _Commands:
@@ -138,6 +139,14 @@ def _launch_refused(state: SlaveState, event: events.LaunchRefused, now: float) 
     held.ready_by, held.ended_at = None, now
     _bury(state, event.instance)
     return [*_start_waiting(state, now), commands.Report((held.status,))]
+
+
+def _start_delayed(state: SlaveState, event: events.StartDelayed, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.status.state is not InstanceState.STARTING:
+        return []
+    held.status = replace(held.status, message=event.reason)
+    return [commands.Report((held.status,))]
 
 
 def _end_ordered(
@@ -285,8 +294,9 @@ def _follow(
     if held is None:
         known = memo or Memo()
         held = state.held[reported.instance] = HeldInstance(
-            reported, awaited=known.awaited, watch=known.watch, devices=known.devices
-        )
+            reported, awaited=known.awaited, watch=known.watch, devices=known.devices,
+            artifacts=known.artifacts,
+        )  # fmt: skip
         if reported.state is InstanceState.RUNNING:
             held.status = _running(held, reported, now)
     elif reported.state is InstanceState.RUNNING:
@@ -393,6 +403,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.MasterLost: _master_lost,
         events.AssignmentsReceived: _assigned,
         events.LaunchRefused: _launch_refused,
+        events.StartDelayed: _start_delayed,
         events.StopOrdered: _end_ordered,
         events.FenceOrdered: _end_ordered,
         events.ContactConfirmed: fencing.contact_confirmed,

@@ -9,6 +9,7 @@ MasterLost              remembers every end until a master has registered this h
 AssignmentsReceived     launches each instance once, as soon as the bounds on running and starting
                         instances allow; refuses an instance that was stopped before
 LaunchRefused           reports that the host cannot run the instance, and why
+StartDelayed            reports why an instance that is starting does not run yet
 StopOrdered             stops the instance; an unknown instance will never be started
 FenceOrdered            kills the instance; an unknown instance will never be started
 ContactConfirmed        sends the last contact to the supervisor, if a live instance has a fence

@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from rosrm.core.slave.health import InstanceHealth
 from rosrm.core.slave.watches import Awaited, Memo, Watch
+from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -43,6 +44,7 @@ class HeldInstance:
             yet, in order.
         ended_at: time of its end, or of the report of the end to a newly registered master.
         devices: devices that it holds.
+        artifacts: artifacts that it uses.
     """
 
     status: InstanceStatus
@@ -56,11 +58,12 @@ class HeldInstance:
     unsettled: tuple[RestartPolicy, ...] = ()
     ended_at: float = 0.0
     devices: tuple[HeldDevice, ...] = ()
+    artifacts: tuple[Artifact, ...] = ()
 
     @property
     def memo(self) -> Memo:
         """Return the facts that a later run of this slave needs."""
-        return Memo(self.awaited, self.watch, self.devices)
+        return Memo(self.awaited, self.watch, self.devices, self.artifacts)
 
     @property
     def watched(self) -> Watch | None:
@@ -99,6 +102,14 @@ class SlaveState:
     held: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
+
+    def used_artifacts(self) -> list[tuple[Artifact, ...]]:
+        """Return the artifacts of each instance that has not ended."""
+        return [
+            held.artifacts
+            for held in self.held.values()
+            if held.artifacts and not held.status.state.ended
+        ]
 
     def awaited_in_graph(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances that become ready when their node appears in the ROS graph."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
+from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import Health
 
@@ -75,8 +76,10 @@ class Memo:
         awaited: None: the instance is ready as soon as it runs.
         watch: None: the instance has no health checks.
         devices: devices that the instance holds.
+        artifacts: artifacts that the instance uses.
     """
 
     awaited: Awaited | None = None
     watch: Watch | None = None
     devices: tuple[HeldDevice, ...] = ()
+    artifacts: tuple[Artifact, ...] = ()

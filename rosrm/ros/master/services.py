@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
@@ -18,6 +18,7 @@ from rosrm.keys.tickets import TICKET_LIFE, Ticket
 from rosrm.model.codec import to_plain
 from rosrm.model.requester import Requester
 from rosrm.model.rows import Listing
+from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names
 from rosrm.ros.control import (
     ControlServer,
@@ -80,6 +81,9 @@ class Queries(Protocol):
     def number_of(self, host: str) -> int | None:
         """Return the number of a host; None: there is no host of that name."""
 
+    def has_artifact(self, digest: str, size: int, /) -> bool:
+        """Return True if the contents with a digest and a size are stored."""
+
 
 class MasterServices:
     """All services of the master; requests become events for `handle`.
@@ -118,8 +122,8 @@ class MasterServices:
         offer(srv.RegisterHost, path(names.REGISTER_HOST), self._take_registration)
         for kind, name, event in (
             (srv.Leave, names.LEAVE, self._left),
-            (srv.Submit, names.SUBMIT, _submitted),
-            (srv.Apply, names.APPLY, _applied),
+            (srv.Submit, names.SUBMIT, self._submitted),
+            (srv.Apply, names.APPLY, self._applied),
             (srv.Cancel, names.CANCEL, _cancelled),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
@@ -177,6 +181,35 @@ class MasterServices:
         elif kind is srv.Apply:
             response.actions = json.dumps(to_plain(reply.actions))
         return response
+
+    def _submitted(self, request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
+        specs = self._specs(request.processes)
+        return happened.SubmissionReceived(token, specs, _requester(peer))
+
+    def _applied(self, request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:
+        targets = tuple(
+            convert.target_from_msg(one, self._specs(one.processes)) for one in request.targets
+        )
+        by = _requester(peer)
+        return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
+
+    def _specs(self, messages: Iterable[Any]) -> tuple[ProcessSpec, ...]:
+        """Return the specs of a request, whose artifacts are stored; raises `Refused`."""
+        specs = tuple(convert.spec_from_msg(message) for message in messages)
+        for spec in specs:
+            for one in spec.artifacts:
+                if not self._queries.has_artifact(one.digest, one.size):
+                    raise Refused(
+                        f"process {spec.name!r}: the master does not have the contents of artifact "
+                        f"{one.name!r}; nothing was queued: submit again",
+                        "unknown",
+                    )
+        if any(spec.schedule.at for spec in specs):
+            # Here, because the core knows no machine, and a replay on another one gives the same
+            # runs.
+            zone = local_zone()
+            specs = tuple(replace(spec, schedule=spec.schedule.in_zone(zone)) for spec in specs)
+        return specs
 
     # --- slaves --------------------------------------------------------------------------
 
@@ -366,21 +399,6 @@ def _check_name(slave: Peer, name: str) -> None:
             f"{own} may not register as {name!r}: a slave registers only the host of its key",
             "denied",
         )
-
-
-def _submitted(request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
-    specs = tuple(convert.spec_from_msg(spec) for spec in request.processes)
-    if any(spec.schedule.at for spec in specs):
-        # Here, because the core knows no machine, and a replay on another one gives the same runs.
-        zone = local_zone()
-        specs = tuple(replace(spec, schedule=spec.schedule.in_zone(zone)) for spec in specs)
-    return happened.SubmissionReceived(token, specs, _requester(peer))
-
-
-def _applied(request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:
-    targets = tuple(convert.target_from_msg(one) for one in request.targets)
-    by = _requester(peer)
-    return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
 
 
 def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:

@@ -13,6 +13,7 @@ from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
 from rosrm.model.values import Assignment, ProcessSpec, RestartPolicy
 from rosrm.slave.launch import ament_index
+from rosrm.slave.launch.artifacts import with_artifacts
 from rosrm.slave.launch.devices import with_devices
 from rosrm.slave.launch.environment import ProcessLocation, process_environment
 from rosrm.slave.launch.launchers import Launchers
@@ -50,7 +51,7 @@ def launch_order(
         LaunchError: the program was not found, with the searched places; or another error of the
             spec on this host.
     """
-    assignment = with_devices(assignment, where.devices)
+    assignment = with_artifacts(with_devices(assignment, where.devices), where.artifacts)
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
     try:

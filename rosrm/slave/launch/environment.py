@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm.artifacts.cache import set_directory
 from rosrm.model.arrays import INDEX_VARIABLE
+from rosrm.model.artifacts import ARTIFACTS_VARIABLE
 from rosrm.model.devices import DEVICE_VARIABLE, Device, device_environment, device_values
 from rosrm.model.values import Assignment, InstanceId, qualified_name
 from rosrm.ros.fast_dds import announcements
@@ -30,6 +32,7 @@ _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
     "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY,
     INDEX_VARIABLE,
+    ARTIFACTS_VARIABLE,
 )  # fmt: skip
 
 
@@ -50,6 +53,7 @@ class ProcessLocation:
         epoch_file: file with the newest epoch of the master; None: there is none.
         instance_key: returns the key of an instance; None: with `security: none`.
         devices: devices of the host.
+        artifacts: directory of the artifacts of all processes; None: there are none.
     """
 
     host: str
@@ -60,6 +64,7 @@ class ProcessLocation:
     epoch_file: Path | None = None
     instance_key: Callable[[InstanceId], bytes | None] = no_key
     devices: tuple[Device, ...] = ()
+    artifacts: Path | None = None
 
 
 def snapshot_directory(snapshots: Path, process: str) -> Path:
@@ -105,6 +110,8 @@ def process_environment(
         environment[INSTANCE_KEY] = base64.b64encode(key).decode()
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update(spec.environment)
+    if spec.artifacts and where.artifacts is not None:
+        environment[ARTIFACTS_VARIABLE] = str(set_directory(where.artifacts, spec.artifacts))
     values = device_values(assignment.devices, where.devices)
     environment.update(device_environment(assignment.devices, values))
     if assignment.shadow:  # a migration waits for the end of its discovery

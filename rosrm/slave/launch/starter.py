@@ -1,4 +1,4 @@
-"""Start of accepted assignments: fetch the snapshot, start the process, await its node."""
+"""Start of accepted assignments: fetch their files, start the process, await its node."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
+from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.epoch import EPOCH_NOTE
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import ProcessLocation, no_key
@@ -33,7 +34,7 @@ _log = logging.getLogger("rosrm.slave")
 
 @dataclass
 class Starter:
-    """Conversion of assignments into orders for the supervisor, after their snapshots arrived.
+    """Conversion of assignments into orders for the supervisor, after their files arrived.
 
     Attributes:
         snapshots: directory of the snapshots.
@@ -48,6 +49,7 @@ class Starter:
     supervisor: SupervisorLink
     endpoint: SlaveEndpoint
     replication: ReplicationService
+    artifacts: ArtifactService
     graph: GraphWatch
     sessions: SessionTable
     launchers: Launchers
@@ -62,23 +64,31 @@ class Starter:
         self._environment = {**os.environ, **self.config.ros.environment()}
 
     def launch(self, assignments: Sequence[Assignment]) -> None:
-        """Start assignments, each as soon as its snapshot is on this host."""
+        """Start assignments, each as soon as its artifacts and its snapshot are on this host."""
         # A later event of the same batch may have removed an instance, as its supervisor is gone.
         wanted = [one for one in assignments if one.instance in self.state.held]
-        ready = [one for one in wanted if self.replication.prepare(one, self._prepared)]
-        if ready:
-            self._start(ready)
-        # Fetching a snapshot may take long, and the supervisor reports nothing before the start.
+        for one in wanted:
+            if one.spec.artifacts:
+                self.artifacts.prepare(one, self._fetched)
+        ready = self._start_prepared([one for one in wanted if not one.spec.artifacts])
+        # Fetching files may take long, and the supervisor reports nothing before the start.
         # Without this report the master would withdraw the assignment.
         waiting = [
-            self.state.held[one.instance].status
-            for one in wanted if one not in ready and one.snapshot_hosts
+            self.state.held[one.instance].status for one in wanted
+            if one not in ready and (one.snapshot_hosts or one.spec.artifacts)
         ]  # fmt: skip
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
 
+    def _start_prepared(self, assignments: Sequence[Assignment]) -> list[Assignment]:
+        """Start those assignments whose snapshots are here, and return them; prepare the others."""
+        ready = [one for one in assignments if self.replication.prepare(one, self._prepared)]
+        if ready:
+            self._start(ready)
+        return ready
+
     def call_off(self, command: commands.Command) -> bool:
-        """Apply a command to an instance that still waits for its snapshot.
+        """Apply a command to an instance that still waits for its artifacts or its snapshot.
 
         Stop and fence cancel the start; a restart has no effect, because the start follows anyway.
         Returns False if the supervisor has to execute the command: it is another one, or the
@@ -86,9 +96,10 @@ class Starter:
         """
         if not isinstance(command, commands.Stop | commands.Fence | commands.Restart):
             return False
-        if not self.replication.is_preparing(command.instance):
+        if not self._is_preparing(command.instance):
             return False
         if not isinstance(command, commands.Restart):  # a restart needs nothing: the start follows
+            self.artifacts.forget(command.instance)
             self.replication.forget(command.instance)
             refusal = "it was stopped before it was started"
             self.take(events.LaunchRefused(command.instance, refusal))
@@ -100,7 +111,10 @@ class Starter:
 
     def has_begun(self, instance: InstanceId) -> bool:
         """Return True if the supervisor has or had the instance."""
-        return instance not in self.state.waiting and not self.replication.is_preparing(instance)
+        return instance not in self.state.waiting and not self._is_preparing(instance)
+
+    def _is_preparing(self, instance: InstanceId) -> bool:
+        return self.artifacts.is_preparing(instance) or self.replication.is_preparing(instance)
 
     def look_at_graph(self, awaited: Mapping[InstanceId, HeldInstance]) -> None:
         """Report the awaited nodes that are in the ROS graph now."""
@@ -115,11 +129,25 @@ class Starter:
         self._graph_before.pop(instance, None)
         self.replication.ended(instance)
 
+    def _fetched(self, assignment: Assignment, fault: str) -> None:
+        if fault:
+            self._refuse(assignment.instance, fault)
+        elif self._is_wanted(assignment):
+            self._start_prepared([assignment])
+
     def _prepared(self, assignment: Assignment) -> None:
-        held = self.state.held.get(assignment.instance)
-        wanted = held is not None and held.status.state is InstanceState.STARTING
-        if wanted and not self._closed:
+        if self._is_wanted(assignment):
             self._start([assignment])
+
+    def _is_wanted(self, assignment: Assignment) -> bool:
+        """Return True if an instance is still to be started after its files have arrived."""
+        held = self.state.held.get(assignment.instance)
+        starting = held is not None and held.status.state is InstanceState.STARTING
+        return starting and not self._closed
+
+    def _refuse(self, instance: InstanceId, reason: str) -> None:
+        _log.info("%s cannot be started here: %s", instance, one_line(reason))
+        self.take(events.LaunchRefused(instance, reason))
 
     def _start(self, assignments: Sequence[Assignment]) -> None:
         orders = []
@@ -138,10 +166,7 @@ class Starter:
                 )  # fmt: skip
                 orders.append(replace(order, memo=to_memo(held.memo)))
             except LaunchError as error:
-                _log.info(
-                    "%s cannot be started here: %s", assignment.instance, one_line(str(error))
-                )
-                self.take(events.LaunchRefused(assignment.instance, str(error)))
+                self._refuse(assignment.instance, str(error))
         if orders:
             self.supervisor.start(orders)
 
@@ -167,5 +192,5 @@ class Starter:
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
             self.snapshots, config.keep.every, config.state / EPOCH_NOTE, self.instance_key,
-            self.endpoint.description.devices,
+            self.endpoint.description.devices, self.artifacts.root,
         )  # fmt: skip

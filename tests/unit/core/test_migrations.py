@@ -15,6 +15,7 @@ from rosrm.core.slave import events
 from rosrm.extensions.contracts import Scores
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import SelectedFilter
+from rosrm.model.artifacts import Artifact
 from rosrm.model.orders import StartInstance
 from rosrm.model.plan import AwaitReady, Commit, Execute, Move, Plan, SetRestart, Start, Step, Stop
 from rosrm.model.values import (
@@ -29,10 +30,12 @@ from tests.unit.core.cluster import Cluster, Machine, StartFirstOrStopFirst, job
 from tests.unit.core.machine import GIB
 
 
-def two_hosts(*, overlap: bool = True, **settings: Any) -> Cluster:
+def two_hosts(
+    *, overlap: bool = True, artifacts: tuple[Artifact, ...] = (), **settings: Any
+) -> Cluster:
     """Return a cluster where p runs on a as a ROS node, and b has room."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.5, "cpu": 0.1}), **settings)
-    cluster.submit(movable("p", overlap=overlap, ros=True))
+    cluster.submit(movable("p", overlap=overlap, ros=True, artifacts=artifacts))
     cluster.discover("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     return cluster
@@ -222,6 +225,17 @@ def test_a_destination_that_never_becomes_ready_is_stopped() -> None:
     (said,) = cluster.recorded("stayed")
     assert said == "p stayed on a: waiting until p#2 is ready on b took longer than 10 s"
     assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+def test_a_start_has_more_time_if_it_fetches_artifacts(monkeypatch) -> None:
+    """One second for each megabyte is added to the time-out of its step."""
+    cluster = two_hosts(artifacts=(Artifact("x", "0" * 64, 20_000_000),))
+    monkeypatch.setattr(cluster.machines["b"], "_launch", lambda *_: None)  # it still fetches
+    cluster.migrate("p")
+    cluster.wait(25.0)
+    assert cluster.state.migrations["p"].undo is None
+    cluster.wait(10.0)
+    assert cluster.state.migrations["p"].undo is not None
 
 
 def test_a_destination_that_refuses_or_ends_is_undone() -> None:

@@ -56,7 +56,13 @@ def registry() -> Registry:
 
 @pytest.mark.parametrize(("title", "text"), FILES)
 def test_every_file_that_is_shown_is_right(title, text, tmp_path, monkeypatch, registry):
-    """`rosrm config check FILE` accepts it, and finds its kind from keys or name."""
+    """`rosrm config check FILE` accepts it, and finds its kind from keys or name.
+
+    The artifacts that it names exist.
+    """
+    for process in yaml.safe_load(text).get("processes", ()):
+        for path in process.get("artifacts", {}).values():
+            (tmp_path / path).mkdir(parents=True)
     file = tmp_path / title
     file.write_text(text, encoding="utf-8")
     monkeypatch.setattr(Registry, "discover", lambda: registry)

@@ -26,6 +26,7 @@ from rosrm.core.slave.events import (
     RestartPolicyRecorded,
     RestartPolicySet,
     SeenInGraph,
+    StartDelayed,
     StopOrdered,
     SupervisorReplaced,
     SupervisorReported,
@@ -108,6 +109,16 @@ def test_a_refused_launch_is_reported(one) -> None:
     (report,) = one.step(LaunchRefused(ONE, "no such package"))
     (status,) = report.statuses
     assert (status.state, status.message) == (STATE.REFUSED, "no such package")
+
+
+def test_a_delayed_start_is_reported_until_the_instance_runs(one) -> None:
+    """The master shows the reason; a late report changes nothing."""
+    one.assign()
+    (report,) = one.step(StartDelayed(ONE, "fetches artifacts"))
+    (status,) = report.statuses
+    assert (status.state, status.message) == (STATE.STARTING, "fetches artifacts")
+    one.status(STATE.RUNNING)
+    assert one.step(StartDelayed(ONE, "fetches artifacts")) == []
 
 
 def test_an_instance_lost_with_its_supervisor_cannot_be_refused_any_more(one) -> None:

@@ -56,9 +56,21 @@ def begin(state: MasterState, migration: Migration, step: Step, now: float) -> b
     if now < migration.retry_at or _is_expected(state, migration, step):
         return False
     migration.begun, migration.answer = True, None
-    migration.deadline = now + max(step.timeout, 0.0)
+    migration.deadline = now + _time_limit(state, migration, step)
     _give_order(state, migration, step, now)
     return True
+
+
+def _time_limit(state: MasterState, migration: Migration, step: Step) -> float:
+    """Return the seconds that a step may take.
+
+    A start may fetch the artifacts of its process first. The start of a restored instance may not,
+    because its source is frozen.
+    """
+    fetches = isinstance(step, Start) and not step.restored
+    return max(step.timeout, 0.0) + (
+        state.processes[migration.process].spec.fetch_time if fetches else 0.0
+    )
 
 
 def _is_expected(state: MasterState, migration: Migration, step: Step) -> bool:
@@ -213,7 +225,8 @@ def _timed_out(state: MasterState, migration: Migration, step: Step, now: float)
         return handoff.timed_out(state, migration, step, now)
     if isinstance(step, AwaitReleased):
         return StepProgress.DONE
-    return StepFailed(f"{title(step)} took longer than {step.timeout:g} s", timed_out=True)
+    limit = _time_limit(state, migration, step)
+    return StepFailed(f"{title(step)} took longer than {limit:g} s", timed_out=True)
 
 
 def _outcome(state: MasterState, migration: Migration, step: Step, now: float) -> StepOutcome:

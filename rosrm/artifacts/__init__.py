@@ -1,0 +1,7 @@
+"""Contents of artifacts, as archives that are named by their digests.
+
+pack.py     a file or directory as an archive, on the submitting machine
+unpack.py   an archive as a directory, on the host of a process
+store.py    the archives at the master
+cache.py    the unpacked artifacts on a host
+"""
