@@ -60,6 +60,7 @@ _BY_TYPE: Final[Mapping[Any, Drawn]] = {
 _BY_NAME: Final[Mapping[str, Drawn]] = {
     "name": PROPER_NAMES,
     "process": PROPER_NAMES,
+    "together": st.just("") | PROPER_NAMES,
     "namespace": _NAMESPACES,
     "talks_to": st.dictionaries(PROPER_NAMES.map("to-{}".format), st.floats(0.0, 1e15), max_size=3),
     "needs": st.dictionaries(PROPER_NAMES, st.floats(0.0, 1e18), max_size=3),

@@ -9,7 +9,7 @@ import numpy as np
 from rosrm.core.master.assignment.neighbours import locate
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.process import DesiredState, ProcessPhase
+from rosrm.core.master.state.process import BEFORE_START, DesiredState, ProcessPhase
 
 
 def no_process_is_lost(state: MasterState) -> None:
@@ -65,6 +65,17 @@ def _devices_balance(state: MasterState, host: Host) -> None:
         migration = state.migrations.get(one.process)
         returns = migration is not None and migration.source_host is host
         assert one.number in host.instances or (returns and not migration.committed), one
+
+
+def gangs_are_known(state: MasterState) -> None:
+    """Check that the index has exactly the processes that await their gang."""
+    waiting = {one.name for one in state.processes.values() if one.awaits_gang}
+    assert waiting == {name for names in state.gangs.members.values() for name in names}
+    for gang, names in state.gangs.members.items():
+        for name in names:
+            process = state.processes[name]
+            assert process.gang == gang
+            assert process.phase in BEFORE_START
 
 
 def known_places_are_current(state: MasterState) -> None:

@@ -25,6 +25,7 @@ from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.values import (
+    GroupMembership,
     HostLossPolicy,
     InstanceState,
     Kind,
@@ -61,6 +62,13 @@ NEEDS = {
     "gpu": (DeviceNeed("gpu"), DeviceNeed("lidar")),
     "half gpu": (DeviceNeed("gpu", 0.5),),
 }
+#: How the processes of one submission are related, to the group of the first one.
+GROUPS = {
+    "": GroupMembership(),
+    "gang": GroupMembership(),
+    "group": GroupMembership("d"),
+    "ends group": GroupMembership("d", "always"),
+}
 GPU = Device("gpu", "0")
 DEVICES = {
     "a": (Device("camera", "front"), GPU),
@@ -86,7 +94,7 @@ def is_open(hosts: HostTable, column: int) -> bool:
 
 def spec(
     name: str, kind: str, memory: int, moves: str, special: bool, priority: int,
-    loss: str = "wait", devices: str = "",
+    loss: str = "wait", devices: str = "", related: str = "",
 ) -> ProcessSpec:  # fmt: skip
     """Draw one of a few sorts of process."""
     word = moves.partition(",")[0]
@@ -103,7 +111,7 @@ def spec(
         standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
         time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
-        devices=NEEDS[devices],
+        devices=NEEDS[devices], together="g" if related == "gang" else "", group=GROUPS[related],
     )  # fmt: skip
 
 
@@ -191,6 +199,7 @@ class Play(RuleBasedStateMachine):
             assert not (over > 1e-6).any(), "assigned over a limit"
             assert is_open(state.hosts, column), "assigned to a host that is closed"
             assert state.hosts.processes[column] <= state.hosts.bound[column]
+        self.look_at_gangs(given)
         self.look_at_order(given)
         self.look_at_states(given)
 
@@ -212,15 +221,39 @@ class Play(RuleBasedStateMachine):
     def look_at_order(self, given: list[Assign]) -> None:
         """Check that no process was passed by an equal one (without backfill: by any)."""
         state = self.cluster.state
-        for assign in given:
-            chosen = state.processes[assign.assignment.instance.process]
-            for name in state.queue:
-                waits = state.processes[name]
-                if awaits_states(state, waits, self.cluster.now) or name in state.queue.delayed:
+        names = {assign.assignment.instance.process for assign in given}
+        for name in names:
+            chosen = state.processes[name]
+            gang = [one for one in names if one in state.gangs.of(chosen)]
+            place = min(self.place(one) for one in gang)
+            for other in state.queue:
+                waits = state.processes[other]
+                if any(self.waits_for_no_room(one) for one in state.gangs.of(waits)):
                     continue
-                ahead = (-waits.spec.priority, waits.order) < (-chosen.spec.priority, chosen.order)
+                ahead = min(self.place(one) for one in state.gangs.of(waits)) < place
                 alike = demand_of(state, waits).key == demand_of(state, chosen).key
+                alike = alike and len(gang) == len(state.gangs.of(waits)) == 1
                 assert not (ahead and (alike or not state.settings.backfill)), "passed"
+
+    def place(self, name: str) -> tuple[int, int]:
+        process = self.cluster.state.processes[name]
+        return -process.spec.priority, process.order
+
+    def waits_for_no_room(self, name: str) -> bool:
+        """Return True if a process waits for something else than room, and blocks no other."""
+        state, queue = self.cluster.state, self.cluster.state.queue
+        process = state.processes[name]
+        delayed = awaits_states(state, process, self.cluster.now) or name in queue.delayed
+        return delayed or name not in queue
+
+    def look_at_gangs(self, given: list[Assign]) -> None:
+        """Check that each gang of which a process was assigned was assigned as a whole."""
+        state = self.cluster.state
+        names = {assign.assignment.instance.process for assign in given}
+        for name in names:
+            process = state.processes[name]
+            if process.awaits_gang:
+                assert names.issuperset(state.gangs.of(process)), "a part of a gang was assigned"
 
     def machine(self, name: str) -> Machine:
         return self.cluster.machines[name]
@@ -277,14 +310,15 @@ class Play(RuleBasedStateMachine):
         memory=st.sampled_from([0, 100, 100, 300]),
         moves=ways | st.just(""),
         special=chance, urgent=chance, twin=names, loss=losses, devices=asked,
+        related=st.sampled_from(list(GROUPS)),
     )  # fmt: skip
     def submit(
         self, name: str, kind: str, memory: int, moves: str, special: bool, urgent: bool,
-        twin: str, loss: str = "wait", devices: str = "",
+        twin: str, loss: str = "wait", devices: str = "", related: str = "",
     ) -> None:  # fmt: skip
         special = special and memory == 300
         specs = [
-            spec(one, kind, memory, moves, special, int(urgent), loss, devices)
+            spec(one, kind, memory, moves, special, int(urgent), loss, devices, related)
             for one in (name, twin)
         ]
         before = set(self.cluster.state.processes)
@@ -743,6 +777,7 @@ class Play(RuleBasedStateMachine):
     @invariant()
     def the_books_balance(self) -> None:
         invariants.the_books_balance(self.cluster.state)
+        invariants.gangs_are_known(self.cluster.state)
 
     @invariant()
     def no_device_is_given_twice(self) -> None:

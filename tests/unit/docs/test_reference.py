@@ -16,6 +16,7 @@ import typer.main
 import rosrm
 from rosrm.cli.commands import app
 from rosrm.config.cluster import load_cluster
+from rosrm.config.groups import GroupInFile
 from rosrm.config.host import load_host
 from rosrm.config.process import NeighboursInFile, ProcessInFile
 from rosrm.config.settings import ClusterConfig, HostConfig
@@ -111,7 +112,7 @@ def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
     wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
-    wanted |= {"limits", "realtime"}
+    wanted |= {"limits", "realtime", "group", *keys(GroupInFile, "group.")}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted

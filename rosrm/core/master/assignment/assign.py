@@ -165,6 +165,7 @@ def place_waiting(state: MasterState, now: float) -> None:
 
 
 def _place(state: MasterState, passed_over: frozenset[str], now: float) -> None:
+    passed_over = _with_gangs(state, passed_over, now)
     if state.settings.backfill:
         _place_any(state, passed_over, now)
     else:
@@ -200,11 +201,11 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a time or snapshot, and do not block those behind them."""
     delayed = _delayed(state, now)
     if not np.isin(state.hosts.condition, _AWAY).any():
-        return _with_gangs(state, delayed, now)
+        return delayed
     names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
     for name in names:
         _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
-    return _with_gangs(state, delayed.union(names), now)
+    return delayed.union(names)
 
 
 def _with_gangs(state: MasterState, waiting: frozenset[str], now: float) -> frozenset[str]:
@@ -238,7 +239,7 @@ def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
             if why:
                 _record_wait_reason(state, state.processes[name], why, now)
                 found.append(name)
-    return _with_gangs(state, frozenset(found), now)
+    return frozenset(found)
 
 
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
@@ -260,8 +261,8 @@ def _versions(state: MasterState) -> tuple[int, ...]:
 
     While none of them grows, a process that did not fit still does not fit.
     """
-    hosts = state.hosts
-    return (hosts.version, len(hosts.touched), state.queue.version, state.learned.version)
+    hosts, others = state.hosts, (state.queue, state.gangs, state.learned)
+    return (hosts.version, len(hosts.touched), *(one.version for one in others))
 
 
 def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> None:

@@ -10,23 +10,28 @@ class Gangs:
 
     Attributes:
         members: gang to the names of those of its processes that have not started.
+        version: counter of changes.
         returned: gangs of which a process has returned to the queue before its start.
     """
 
     def __init__(self) -> None:
         self.members: dict[GangKey | None, dict[str, None]] = {}
+        self.version = 0
         self.returned: dict[GangKey, None] = {}
 
     def add(self, process: Process) -> None:
         """Add a process that awaits its gang, unless it is known."""
-        self.members.setdefault(process.gang, {})[process.name] = None
+        self.version += process.name not in self.members.setdefault(process.gang, {})
+        self.members[process.gang][process.name] = None
 
     def leave(self, process: Process) -> None:
         """Let a process be placed alone from now on."""
-        members = self.members.get(process.gang, {})
-        members.pop(process.name, None)
-        if not members:
-            self.members.pop(process.gang, None)
+        members = self.members.get(process.gang)
+        if members is not None:
+            members.pop(process.name, None)
+            self.version += 1
+            if not members:
+                del self.members[process.gang]
         process.awaits_gang = False
 
     def of(self, process: Process) -> list[str]:
