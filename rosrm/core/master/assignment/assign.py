@@ -309,7 +309,7 @@ def _place_gang(state: MasterState, members: Sequence[Process], now: float) -> b
             ranking = ranking_of(state, demand_of(state, process))
             _assign(state, process, ranking, decide(ranking, chosen=column), now)
         return True
-    never = gangs.why_gang_never(state, members)
+    never = gangs.why_gang_never(state, members, now)
     if never:
         why = f"no hosts may take {gangs.size_of(members)}: {never}"
         for process in members:
@@ -400,34 +400,29 @@ def reconsider_set_aside(state: MasterState, now: float) -> None:
     """
     if not state.set_aside:
         return
-    judged: dict[object, str] = {}
+    judged: dict[object, tuple[str, bool]] = {}
     aside = [state.processes[name] for name in state.set_aside]
     for process in sorted(aside, key=lambda one: one.order):
-        demand = demand_of(state, process)
-        key = process.gang or demand.key
+        key = process.gang or demand_of(state, process).key
         if key not in judged:
-            judged[key] = _why_still_aside(state, process, demand)
-        if judged[key]:
-            _keep_aside(state, process, judged[key], now)
-        elif _may_be_placed(state, process, demand):
+            judged[key] = _judged(state, process, now)
+        never, may_be_placed = judged[key]
+        if never:
+            _keep_aside(state, process, never, now)
+        elif may_be_placed:
             _return_from_aside(state, process, now)
 
 
-def _why_still_aside(state: MasterState, process: Process, demand: Demand) -> str:
-    """Return why no hosts may take a process and its gang; "" if some may."""
+def _judged(state: MasterState, process: Process, now: float) -> tuple[str, bool]:
+    """Return why no hosts may take a process and its gang ("": some may), and if known ones may."""
     members = gangs.members_of(state, process)
-    if len(members) == 1:
-        never = why_never(state.hosts, demand)
-        return never and _why_aside(never)
-    never = gangs.why_gang_never(state, members)
-    return never and f"no hosts may take {gangs.size_of(members)}: {never}"
-
-
-def _may_be_placed(state: MasterState, process: Process, demand: Demand) -> bool:
-    members = gangs.members_of(state, process)
-    if len(members) == 1:
-        return a_known_host_may(state.hosts, demand)
-    return gangs.known_hosts_may(state, members)
+    if len(members) > 1:
+        never = gangs.why_gang_never(state, members, now)
+        why = never and f"no hosts may take {gangs.size_of(members)}: {never}"
+        return why, gangs.known_hosts_may(state, members)
+    demand = demand_of(state, process)
+    never = why_never(state.hosts, demand)
+    return never and _why_aside(never), a_known_host_may(state.hosts, demand)
 
 
 def _return_from_aside(state: MasterState, process: Process, now: float) -> None:

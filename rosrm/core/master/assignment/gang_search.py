@@ -4,9 +4,9 @@ A trial adds an instance and its reservation to the state itself. So each filter
 policy judges the next process exactly as after an assignment. At the end of a search, successful or
 not, all trials are undone, and no command was emitted.
 
-The process with the fewest hosts goes first, which finds a dead end soon. A host at which the rest
-of the gang finds no place is left for the next best one. The number of trials is bounded, because
-the question is NP-hard (bin packing).
+The process with the fewest hosts goes first, then the one with the largest needs, which finds a
+dead end soon. A host that leaves no place for the rest of the gang is replaced by the next best
+one. The number of trials is bounded, because the question is NP-hard (bin packing).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rosrm.model.values import InstanceId
 #: Most processes of one gang.
 MOST_MEMBERS: Final = 64
 #: Most trials of one search.
-_MOST_TRIALS: Final = 300
+_MOST_TRIALS: Final = 200
 #: Tolerance in comparisons of sums of fractions.
 _CLOSE: Final = 1e-9
 _NO_NAMES: Final = frozenset[str]()
@@ -47,7 +47,7 @@ class Blocked:
 
     Attributes:
         process: a process without a host.
-        beside: True: it fits on a host, but not together with the others.
+        beside: True: it fits on a host, but the search found none beside the others.
         certain: False: the search has used up its trials.
     """
 
@@ -67,11 +67,20 @@ class _Search:
 
     def run(self, members: Sequence[Process]) -> Places | Blocked:
         """Return the places, or why there are none."""
-        if self._place(list(members), frozenset()):
+        for process in members:
+            if not awaited_neighbour(self.state, process, besides=_NO_NAMES):
+                if not self._columns(process):
+                    return Blocked(process, beside=False, certain=True)
+        if self._place(sorted(members, key=self._rank), frozenset()):
             return self.places
         assert self.dead_end is not None
-        depth, process = self.dead_end
-        return Blocked(process, depth > 0, self.trials < _MOST_TRIALS)
+        return Blocked(self.dead_end[1], beside=True, certain=self.trials < _MOST_TRIALS)
+
+    def _rank(self, process: Process) -> tuple[int, float]:
+        """Return the place of a process in the search: fewest hosts, then largest needs."""
+        ranking = ranking_of(self.state, demand_of(self.state, process))
+        need = ranking.need[np.isfinite(ranking.need)]
+        return len(self._columns(process)), -float(need.max(initial=0.0))
 
     def _place(self, left: Sequence[Process], closed: frozenset[tuple[_Kind, int]]) -> bool:
         """Find places for the rest of the gang.
@@ -81,9 +90,11 @@ class _Search:
         """
         if not left:
             return True
-        process, columns = self._next(left, closed)
+        process = self._next(left)
         rest, kind = [one for one in left if one is not process], self._kind(process)
-        for column in columns:
+        for column in self._columns(process):
+            if (kind, column) in closed:
+                continue
             if self.trials >= _MOST_TRIALS:
                 break
             self.trials += 1
@@ -99,21 +110,15 @@ class _Search:
             self.dead_end = depth, process
         return False
 
-    def _next(
-        self, left: Sequence[Process], closed: frozenset[tuple[_Kind, int]]
-    ) -> tuple[Process, list[int]]:
-        """Return the process with the fewest hosts, and their columns, best first."""
-        known: dict[Hashable, list[int]] = {}
-        found: list[tuple[Process, list[int]]] = []
-        for process in left:
-            if awaited_neighbour(self.state, process, besides=_NO_NAMES):
-                continue  # its neighbour in the gang goes first
-            kind, key = self._kind(process), demand_of(self.state, process).key
-            if key not in known:
-                known[key] = self._columns(process)
-            columns = [column for column in known[key] if (kind, column) not in closed]
-            found.append((process, columns))
-        return min(found, key=lambda one: len(one[1]), default=(left[0], []))
+    def _next(self, left: Sequence[Process]) -> Process:
+        """Return the first process that waits for no neighbour, which may be one of the gang."""
+        return next(
+            (
+                process for process in left
+                if not awaited_neighbour(self.state, process, besides=_NO_NAMES)
+            ),
+            left[0],
+        )  # fmt: skip
 
     def _kind(self, process: Process) -> _Kind:
         """Return the kind of a process; None: others may be told apart from it by their rules."""
@@ -138,7 +143,9 @@ class _Search:
         saved = state.hosts.saved(host)
         instance = InstanceId(process.name, -len(self.places))  # no instance has such a number
         demand, devices = demand_of(state, process), self._devices(process, host)
-        state.queue.remove(process.name)
+        queued = process.name in state.queue  # else it is set aside
+        if queued:
+            state.queue.remove(process.name)
         state.add_instance(instance, host, 0.0, demand, devices=devices)
         process.owner = instance.number
         try:
@@ -146,7 +153,8 @@ class _Search:
         finally:
             process.owner = 0
             state.drop_instance(state.instances[instance.number])
-            state.queue.add(process.name, process.spec.priority, process.order)
+            if queued:
+                state.queue.add(process.name, process.spec.priority, process.order)
             state.hosts.restore(saved)
 
 

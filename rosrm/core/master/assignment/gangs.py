@@ -16,6 +16,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from math import inf
+from typing import Final
 
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.demands import demand_of
@@ -29,6 +31,9 @@ from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import listed, standing
+
+#: Seconds for which the answer of a search stands, because a gang may wait for long.
+_JUDGED_FOR: Final = 1.0
 
 
 def check_gangs(state: MasterState, specs: Sequence[ProcessSpec], principal: str) -> None:
@@ -87,19 +92,28 @@ def _why_incomplete(state: MasterState, absent: Sequence[str], held: Sequence[st
     return f"{gang} {standing(other.phase.value)}"
 
 
-def why_gang_never(state: MasterState, members: Sequence[Process]) -> str:
+def why_gang_never(state: MasterState, members: Sequence[Process], now: float) -> str:
     """Return why no hosts may take all of a gang before a lasting change; "" if some may."""
     table = state.hosts
     for process in members:
         never = why_never(table, _demand_without_mates(state, process, members))
         if never:
             return f"{process.name}: {never}"
-    if not table.listed():
-        return ""
-    found = find_places_if_empty(state, members)
-    if isinstance(found, Blocked) and found.certain:
-        return f"{found.process.name} fits on no host beside the others, even if nothing else runs"
-    return ""
+    return _why_never_together(state, members, now) if table.listed() else ""
+
+
+def _why_never_together(state: MasterState, members: Sequence[Process], now: float) -> str:
+    """Return why a gang does not fit even on empty hosts; the answer stands for a second."""
+    names = tuple(process.name for process in members)
+    at, why = state.gangs.judged.get(names, (-inf, ""))
+    if now - at >= _JUDGED_FOR:
+        found = find_places_if_empty(state, members)
+        why = ""
+        if isinstance(found, Blocked) and found.certain:
+            name = found.process.name
+            why = f"{name} fits on no host beside the others, even if nothing else runs"
+        state.gangs.judged[names] = now, why
+    return why
 
 
 def known_hosts_may(state: MasterState, members: Sequence[Process]) -> bool:

@@ -10,12 +10,15 @@ class Gangs:
 
     Attributes:
         members: gang to the names of those of its processes that have not started.
+        judged: names of waiting processes to the time of a judgement, and why they do not even fit
+            together on empty hosts; "": they may.
         version: counter of changes.
         returned: gangs of which a process has returned to the queue before its start.
     """
 
     def __init__(self) -> None:
         self.members: dict[GangKey | None, dict[str, None]] = {}
+        self.judged: dict[tuple[str, ...], tuple[float, str]] = {}
         self.version = 0
         self.returned: dict[GangKey, None] = {}
 
@@ -30,6 +33,7 @@ class Gangs:
         if members is not None:
             members.pop(process.name, None)
             self.version += 1
+            self.judged.clear()
             if not members:
                 del self.members[process.gang]
         process.awaits_gang = False
