@@ -221,8 +221,8 @@ _NAMES: Final = {
     "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",
     "model.values": (
         "Accounting GroupMembership Health HostDescription HostLossPolicy InstanceId "
-        "IsolationPolicy Kind MigrationPolicy NeighbourRule ProcessSpec Readiness Reading ReschedulePolicy "
-        "ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
+        "IsolationPolicy Kind MigrationPolicy NeighbourRule ProcessSpec Readiness Reading "
+        "ReschedulePolicy ResourceDescription RestartPolicy StandbyPolicy StopPolicy"
     ),
 }
 _MODULES: Final = {

@@ -31,9 +31,7 @@ def cancel(
     message = f"a cancellation of {process.name} was requested"
     if cause:
         message = f"{process.name} is cancelled: {cause}"
-    state.record(
-        now, EventKind.CANCEL_REQUESTED, message, process=process.name, facts=facts, by=by
-    )
+    state.record(now, EventKind.CANCEL_REQUESTED, message, process=process.name, facts=facts, by=by)
     if process.phase in WAITING:
         state.unqueue(process)
         state.set_phase(process, ProcessPhase.CANCELLED, now, cause)

@@ -157,9 +157,7 @@ class MasterState:
         self.images = Images()
         self.pending_orders = PendingOrders()
         self.periodic = Periodic()
-        self.next_order = 1
-        self.next_instance = 1
-        self.reserved_instances = 1
+        self.next_order = self.next_instance = self.reserved_instances = 1
         self.wall = 0.0
         self.contact_since = inf
         self.held_since = inf

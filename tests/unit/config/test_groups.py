@@ -46,7 +46,7 @@ def test_all_processes_of_a_file_are_members_of_its_group(file, group, ends):
         ("{name: demo}", "group: give `ends_with` or `fails_with`"),
         ("{name: ../x, ends_with: any}", "'../x' cannot be the name of a group"),
         ("{name: demo, end_with: any}", "unknown key 'end_with' in group; did you mean"),
-        ("demo", "group: a mapping is required, not \"demo\""),
+        ("demo", 'group: a mapping is required, not "demo"'),
     ],
 )
 def test_a_wrong_group_is_refused_with_its_place(refusal, group, said):

@@ -68,9 +68,9 @@ class _Search:
     def run(self, members: Sequence[Process]) -> Places | Blocked:
         """Return the places, or why there are none."""
         for process in members:
-            if not awaited_neighbour(self.state, process, besides=_NO_NAMES):
-                if not self._columns(process):
-                    return Blocked(process, beside=False, certain=True)
+            awaits = awaited_neighbour(self.state, process, besides=_NO_NAMES)
+            if not awaits and not self._columns(process):
+                return Blocked(process, beside=False, certain=True)
         if self._place(sorted(members, key=self._rank), frozenset()):
             return self.places
         assert self.dead_end is not None

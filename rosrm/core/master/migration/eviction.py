@@ -18,8 +18,8 @@ from rosrm.core.master.assignment.assign import (
     demand_to_move,
     joint_demand,
     measured_need,
-    ranking_of,
 )
+from rosrm.core.master.assignment.demands import ranking_of
 from rosrm.core.master.assignment.neighbours import moving_neighbour, running_with
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState

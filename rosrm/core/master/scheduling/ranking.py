@@ -179,12 +179,11 @@ class Ranking:
         return found
 
     def in_order(self) -> list[int]:
-        """Return all fitting columns, best first: within the best tier by value, then the others."""
+        """Return all fitting columns, best first: by the tier of labels, then by value."""
         fitting = np.flatnonzero(self.value < np.inf)
-        keys = [self.value[fitting]] if self._tier is None else [
-            self.value[fitting], self._tier[fitting],
-        ]  # fmt: skip
-        return [int(column) for column in fitting[np.lexsort(keys)]]
+        tiers = () if self._tier is None else (self._tier[fitting],)
+        order = np.lexsort((self.value[fitting], *tiers))  # the last key comes first
+        return [int(column) for column in fitting[order]]
 
     def fits(self, column: int) -> bool:
         """Return True if this host may take the process now."""

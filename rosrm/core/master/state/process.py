@@ -17,7 +17,6 @@ from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import GroupEnd, InstanceId, InstanceState, ProcessSpec
 
-
 #: Principal and name of a gang.
 GangKey = tuple[str, str]
 
