@@ -25,7 +25,7 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
                 HostDescription, ResourceRow, DeviceRow, PluginRow, EventRow, LogChunk, WaitResult
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
-                ReschedulePolicy
+                ReschedulePolicy, GroupMembership
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device

@@ -5,7 +5,7 @@ events.py, commands.py, outcomes.py, settings.py
 master_state.py, state/   data and the rules that keep it consistent
 tick.py        periodic work
 requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
-               pruning.py, graph_names.py
+               pruning.py, graph_names.py, cancellation.py
 answers.py     answers of slaves to orders; reloading.py
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
