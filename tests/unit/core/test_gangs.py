@@ -98,7 +98,7 @@ def test_a_gang_waits_for_the_one_process_that_fits_nowhere() -> None:
 
 
 def test_a_waiting_gang_blocks_those_behind_it_unless_backfill_is_on() -> None:
-    """It counts as one element at the place of its first process."""
+    """The gang counts as one element at the place of its first process."""
     for backfill, after in ((False, "queued"), (True, "running")):
         cluster = cluster_of("ab", backfill=backfill).with_processes(process("other", memory=600))
         cluster.submit(*gang(300, 400, 400), process("small", memory=50))
@@ -151,7 +151,7 @@ def test_neighbours_inside_a_gang_do_not_wait_for_each_other() -> None:
 
 
 def test_a_gang_waits_for_a_neighbour_of_one_process() -> None:
-    """It blocks no other process, and its reasons say so."""
+    """The gang blocks no other process, and its reasons say so."""
     first, second = gang(100, 100)
     first = replace(first, neighbours=(NeighbourRule("near", ("map",)),))
     cluster = cluster_of("ab").with_processes(first, second, process("other"))
@@ -166,7 +166,7 @@ def test_a_gang_waits_for_a_neighbour_of_one_process() -> None:
 
 
 def test_a_gang_of_which_one_process_fits_nowhere_is_set_aside_as_a_whole() -> None:
-    """It returns to the queue when a host may take all."""
+    """All return to the queue when hosts may take all."""
     first, second = gang(100, 100)
     second = replace(second, required_labels={"arm": "yes"})
     cluster = cluster_of("ab").with_processes(first, second, process("other"))
@@ -304,7 +304,7 @@ def test_a_running_process_of_a_gang_returns_to_the_queue_alone() -> None:
 def test_a_gang_stays_one_after_a_restart_of_the_master() -> None:
     """Queued or set aside."""
     cluster = Cluster(machine("a", used=0.6), machine("b"))
-    cluster.submit(*gang(300, 500, 300), *gang(900, 10, name="large"))
+    cluster.submit(*gang(900, 10, name="large"), *gang(300, 500, 300))
     cluster.restart_master()
     cluster.wait(1.0)
     assert (phases(cluster), phases(cluster, "large")) == (["queued"] * 3, ["set_aside"] * 2)

@@ -148,7 +148,7 @@ def test_a_group_is_that_of_one_user() -> None:
 
 
 def test_a_process_that_a_client_restarts_has_no_cause_left() -> None:
-    """It may be cancelled for another cause later."""
+    """The next cancellation may have another cause."""
     cluster = demo()
     end(cluster, "rviz")
     cluster.wait(1.0)

@@ -177,8 +177,8 @@ class _SearchIfEmpty(_Search):
         over = np.where(np.isinf(need), 0.0, need) + self._load > table.limit + _CLOSE
         has_room = ~np.logical_or.reduce(over) & (self._number < table.bound)
         fits = possible(table, demand) & (has_room | table.without_reading())
-        for column in np.flatnonzero(fits & has_room):
-            if self._inventory(int(column)).choose(process.spec.devices) is None:
+        for column, inventory in self._inventories.items():
+            if inventory.choose(process.spec.devices) is None:
                 fits[column] = False
         emptiest_first = np.argsort(self._load.sum(axis=0), kind="stable")
         return [int(column) for column in emptiest_first if fits[column]]

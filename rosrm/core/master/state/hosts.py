@@ -123,7 +123,7 @@ class Host:
 
 
 class SavedColumn(NamedTuple):
-    """What reservations on one host change."""
+    """Values that reservations on one host change."""
 
     column: int
     cells: FloatArray
