@@ -407,7 +407,7 @@ sizes = st.lists(st.sampled_from([150.0, 400.0, 700.0, 1000.0]), min_size=1, max
 
 
 @given(first=needs, second=needs, sizes=sizes, backfill=st.booleans())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_two_gangs_that_each_fit_alone_both_run_in_the_end(
     first: list[float], second: list[float], sizes: list[float], backfill: bool
 ) -> None:
