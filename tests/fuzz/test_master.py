@@ -10,7 +10,7 @@ import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -21,6 +21,8 @@ from rosrm.core.master import events as happened
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
     RESOURCE_SLOTS,
+    GroupEnd,
+    GroupMembership,
     HostDescription,
     InstanceId,
     InstanceState,
@@ -70,6 +72,10 @@ SPECS = values_of(
     ProcessSpec,
     {**KNOWN, "name": names, "needs": st.dictionaries(RESOURCES, floats, max_size=2),
      "isolation": values_of(IsolationPolicy, {**KNOWN, "after": FENCES}),
+     "together": st.sampled_from(["", "", "g"]),
+     "group": st.builds(
+         GroupMembership, st.sampled_from(["", "d"]), st.sampled_from(get_args(GroupEnd))
+     ),
      "migration": values_of(MigrationPolicy, {
          **KNOWN, "strategy": st.sampled_from([None, "relaunch", "handoff", "criu", "none"]),
          "options": st.dictionaries(st.sampled_from(["ready_timeout", "x"]), texts | floats,

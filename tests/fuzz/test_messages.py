@@ -106,6 +106,7 @@ def test_a_sound_spec_with_hostile_fields_is_converted_or_refused(data):
         name="p", command=["run"], kind="service", readiness=msg.Readiness(kind="auto"),
         host_loss=msg.HostLossPolicy(then="wait"), isolation=msg.IsolationPolicy(then="keep"),
         restart=msg.RestartPolicy(when="never", factor=1.0),
+        group=msg.GroupMembership(ends="never"),
     )  # fmt: skip
     hints = msg.ProcessSpec.get_fields_and_field_types()
     for name in data.draw(st.lists(st.sampled_from(sorted(hints)), max_size=4)):
