@@ -253,6 +253,29 @@ def test_a_refusal_before_the_start_returns_all_that_have_not_started() -> None:
     assert steps[0] == {"sensing-0", "sensing-1", "sensing-2"}
 
 
+def test_assigned_processes_are_recalled_when_one_returns() -> None:
+    """They have not started, and are placed again together with the refused one."""
+    cluster = cluster_of("ab", delivery_timeout=30.0, lease=60.0, suspect=50.0)
+    cluster.cut("a", "b")
+    steps = steps_with_assignments(cluster)
+    cluster.submit(*gang(700, 700))
+    of_a = cluster.state.hosts.by_name["a"].instances
+    ((refused, _),) = of_a.values()
+    other = {"sensing-0": "sensing-1", "sensing-1": "sensing-0"}[refused]
+    cluster.machines["a"].refuses[refused] = "no such program"
+    cluster.reconnect("a", seconds=1.0)
+    why = f"{refused} of its gang sensing has returned to the queue"
+    assert cluster.recorded("stopping") == [f"{other} is stopped before its start: {why}"]
+    assert cluster.phase(other) == "stopping"
+    waits = cluster.explain(refused)["reason"]
+    assert waits == f"{other} of its gang sensing is stopping"
+    cluster.add(machine("c"))
+    cluster.reconnect("b", seconds=5.0)
+    assert phases(cluster) == ["running"] * 2
+    assert len(steps) == 2
+    assert steps[1] == {"sensing-0", "sensing-1"}
+
+
 def test_a_process_that_has_started_is_not_touched_by_a_refusal() -> None:
     """The refused process is then placed alone."""
     cluster = cluster_of("ab")
