@@ -195,6 +195,7 @@ SPECS: Final = st.builds(
     ),
     drawn(
         ProcessSpec,
+        application=st.one_of(st.just(""), PROPER_NAMES),
         neighbours=st.lists(_NEIGHBOURS, max_size=3).map(tuple),
         artifacts=st.lists(_ARTIFACTS, max_size=3, unique_by=lambda one: one.name).map(tuple),
     ),

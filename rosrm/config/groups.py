@@ -38,11 +38,16 @@ class GroupInFile:
 def grouped(
     specs: Sequence[ProcessSpec], root: Node, problems: Problems
 ) -> tuple[ProcessSpec, ...]:
-    """Return the processes of a file as members of its group, if it has one."""
-    node = root.get("group")
+    """Return the processes of a file as members of its group, if it has one.
+
+    The group of an application has the name of the application, unless the file gives another one.
+    """
+    node, app = root.get("group"), root.get("app")
     group = None if node is None else validated(GroupInFile, node, problems, "group")
     if node is None or group is None:
         return tuple(specs)
+    if not group.name and app is not None and isinstance(app.value, str):
+        group = replace(group, name=app.value)
     _check(group, node, [spec.name for spec in specs], problems)
     return tuple(replace(spec, group=group.membership(spec.name)) for spec in specs)
 

@@ -299,7 +299,8 @@ class ProcessInFile:
             array=self._membership(),
             schedule=_same(Schedule, self),
             start_order=self.after,
-            group=GroupMembership(),  # of the file as a whole
+            group=GroupMembership(),  # of the file as a whole, as the application
+            application="",
             secrets={name: secret.file for name, secret in self.secrets.items()},
             container=Container() if self.container is None else _same(Container, self.container),
             artifacts=artifacts_of(self.artifacts),

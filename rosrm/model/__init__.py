@@ -1,6 +1,7 @@
 """Values that all parts share, and their conversion to JSON.
 
 values.py               processes, hosts, instances, resources
+applications.py         applications: targets, planned actions, rows
 artifacts.py            files and directories that processes get on their hosts
 devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit

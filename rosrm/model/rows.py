@@ -115,11 +115,11 @@ class ProcessRow:
     reason: str
     stale: bool = False
     owner: str = ""
-    application: str = ""
     cpu_limit: float = 0.0
     memory_limit: int = 0
     array: str = ""
     next_run: float = 0.0
+    application: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,11 +51,11 @@ def ps(  # noqa: PLR0917 - an argument for each option
     connection.print_trouble(snapshot)
     check_name("host", host, [row.description.name for row in snapshot.hosts])
     check_name("array", array, {row.array for row in snapshot.processes if row.array})
-    check_name("application", application, [row.name for row in snapshot.applications])
     shown = [row for row in snapshot.processes if not host or row.host == host]
     if array:
         shown = [row for row in shown if row.array == array]
     if application:
+        check_name("application", application, [row.name for row in snapshot.applications])
         shown = [row for row in shown if row.application == application]
     if as_json:
         forms = json_forms.forms(shown)

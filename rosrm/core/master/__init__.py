@@ -10,6 +10,7 @@ answers.py     answers of slaves to orders; reloading.py
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
 start_order.py starts after other processes, stops before them; dependants.py
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
+applications/  versions of applications, replacement of processes, plans
 scheduling/    choice of a host for a process: filter, score, pick
 assignment/    assignment of waiting processes, reservation of their load
 hosts/         registration, readings, loss, fencing, re-adoption

@@ -211,7 +211,7 @@ def test_cancel_takes_the_jobs_of_an_array(rosrm, client):
 def test_cancel_needs_names_or_all_of_them(rosrm, client, words):
     result = rosrm("cancel", *words)
     assert (result.code, client.asked) == (2, [])
-    assert "give names of processes or work files, --array NAME, or --all" in result.err
+    assert "give names of processes or work files, --array NAME, --app NAME, or --all" in result.err
 
 
 def test_cancel_wait_ends_when_all_have_ended(rosrm, client, while_asleep):

@@ -19,6 +19,7 @@ from rosrm.config.cluster import load_cluster
 from rosrm.config.groups import GroupInFile
 from rosrm.config.host import load_host
 from rosrm.config.process import NeighboursInFile, ProcessInFile
+from rosrm.config.rollout import RolloutInFile
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.config.work import load_work
 from rosrm.extensions import contracts, hookspecs, installed
@@ -114,6 +115,7 @@ def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
     wanted |= {"limits", "realtime", "container", "after.delay", "after.on_restart"}
     wanted |= {"group", *keys(GroupInFile, "group.")}
+    wanted |= {"app", "rollout", *keys(RolloutInFile, "rollout.")}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted

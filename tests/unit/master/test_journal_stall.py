@@ -15,7 +15,8 @@ from rosrm.model.values import InstanceId
 from tests.unit.core.cluster import Cluster, process
 
 REFUSED = {
-    happened.HostRegistered, happened.SubmissionReceived, happened.CancelRequested,
+    happened.HostRegistered, happened.SubmissionReceived, happened.ApplicationsRequested,
+    happened.CancelRequested,
     happened.RestartRequested, happened.MigrationRequested, happened.HostStateRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.PruneRequested,
     happened.RebalanceRequested, happened.ReloadRequested,

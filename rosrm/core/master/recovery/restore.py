@@ -216,6 +216,7 @@ def _restored_migration(
         source_host=hosts[move["source_host"]],
         destination=InstanceId(process.name, int(move["destination"])),
         destination_host=hosts[move["destination_host"]],
+        spec=from_plain(ProcessSpec, move["spec"]) if "spec" in move else None,
         **fields_from_plain(Migration, {"wall": wall, **move}, migration.JOURNALED),
     )  # fmt: skip
     if move["back"]:

@@ -10,7 +10,7 @@ from rosrm.core.master.commands import OrderId
 from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Plain
-from rosrm.model.codec import fields_from_plain, fields_to_plain
+from rosrm.model.codec import fields_from_plain, fields_to_plain, to_plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.model.values import InstanceId, InstanceStatus, ProcessSpec
@@ -196,7 +196,7 @@ def undo_steps(plan: Plan, turned_at: int) -> Sequence[Step]:
 JOURNALED: Final = (
     "strategy", "cause", "wall", "source_node", "destination_node", "index", "turned_at",
     "committed", "failure", "launched", "suspended", "results", "aim",
-    "source_devices", "spec",
+    "source_devices",
 )  # fmt: skip
 _END: Final = ("ordered", "completed", "gone")
 _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
@@ -215,6 +215,7 @@ def migration_to_dict(migration: Migration, stopping: Sequence[int]) -> dict[str
         "destination": migration.destination.number,
         "destination_host": migration.destination_host.name,
         "ended": {str(number): _end_to_dict(end) for number, end in migration.ended.items()},
+        **({} if migration.spec is None else {"spec": to_plain(migration.spec)}),
         **fields_to_plain(migration, JOURNALED),
     }  # fmt: skip
 
