@@ -128,8 +128,10 @@ class _Job:
                 time.sleep(PERIOD)
 
     def _row(self) -> ProcessRow | None:
-        listed = ask_until_answered(self.client.list_processes, note)
-        return next((row for row in listed if row.name == self.name), None)
+        view = ask_until_answered(
+            lambda on_wait: self.client.list(processes=True, on_wait=on_wait), note
+        )
+        return next((row for row in view.processes if row.name == self.name), None)
 
     def _copy(self, *, has_ended: bool) -> bool:
         """Copy new output; return False if there was none."""
@@ -167,7 +169,7 @@ class _Job:
         if row.state in _WAITING and time.monotonic() - self._since > _PATIENCE:
             if "waits" not in self._reported:
                 self._reported.add("waits")
-                story = ask_until_answered(lambda: self.client.explain(self.name), note)
+                story = ask_until_answered(lambda _: self.client.explain(self.name), note)
                 note(f"{self.name} waits for a host: {story['reason'] or 'no reason is known yet'}")
         elif row.state in _NOTEWORTHY and row.state not in self._reported:
             self._reported.add(row.state)

@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
 from rosrm.client.connecting import connect, ros_settings, row_of, security_mode
@@ -282,12 +281,15 @@ class Client:
             follow: True: then yield new events until the time-out.
             timeout: seconds of following; None: no limit.
         """
+
+        def look(on_wait: Callable[[float], None]) -> Listing:
+            return self.list(
+                events=True, process=process, host=host, after=after, newest=newest,
+                on_wait=on_wait,
+            )  # fmt: skip
+
         deadline = deadline_after(timeout)
         while True:
-            look = partial(
-                self._master.list, events=True, process=process, host=host, after=after,
-                newest=newest,
-            )  # fmt: skip
             view = ask_until_answered(look, self._notify, deadline if follow else 0.0)
             yield from view.events
             if not follow or time.monotonic() >= deadline:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rosrm.errors import NoMaster
+
+if TYPE_CHECKING:
+    from rosrm.ros.master_connection import OnWait
 
 T = TypeVar("T")
 
@@ -25,12 +28,14 @@ def deadline_after(timeout: float | None) -> float:
     return math.inf if timeout is None else time.monotonic() + timeout
 
 
-def ask_until_answered(look: Callable[..., T], notify: Notify, deadline: float = math.inf) -> T:
+def ask_until_answered(
+    look: Callable[[OnWait], T], notify: Notify, deadline: float = math.inf
+) -> T:
     """Return the master's answer, retrying until the deadline; notify if it is silent.
 
     Args:
         look: asks the master; raises `NoMaster` after some seconds without an answer. Its argument
-            `on_wait` takes the seconds of a wait, repeatedly.
+            takes the seconds of a wait, repeatedly.
         notify: takes a message when the silence begins, one with the places to check, and one when
             the silence ends.
         deadline: monotonic seconds after which the silence is an error.
@@ -48,7 +53,7 @@ def ask_until_answered(look: Callable[..., T], notify: Notify, deadline: float =
 
     while True:
         try:
-            answer = look(on_wait=on_wait)
+            answer = look(on_wait)
         except NoMaster as error:
             if time.monotonic() >= deadline:
                 raise

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
@@ -100,7 +99,9 @@ def wait_for_processes(
     changes = _Changes(on_change)
     verdicts: dict[str, _Verdict] = {}
     while True:
-        view = ask_until_answered(partial(master.list, processes=True), notify, deadline)
+        view = ask_until_answered(
+            lambda on_wait: master.list(processes=True, on_wait=on_wait), notify, deadline
+        )
         rows = {row.name: row for row in view.processes}
         ours = [rows[name] for name in names if name in rows]
         verdicts.update((row.name, _judge(row, until, before)) for row in ours)
@@ -136,7 +137,9 @@ def wait_for_applications(
     deadline = deadline_after(timeout)
     seen: dict[str, ApplicationRow] = {}
     while True:
-        view = ask_until_answered(lambda: master.list(applications=True), notify, deadline)
+        view = ask_until_answered(
+            lambda on_wait: master.list(applications=True, on_wait=on_wait), notify, deadline
+        )
         rows = [row for row in view.applications if row.name in names]
         for row in rows:
             if row.pending and seen.get(row.name) != row:
@@ -202,7 +205,7 @@ def wait_for_migration(
     """
     changes = _Changes(on_change)
 
-    def look(on_wait: OnWait | None = None) -> WaitResult:
+    def look(on_wait: OnWait) -> WaitResult:
         view = master.list(processes=True, events=True, process=name, after=after, on_wait=on_wait)
         for event in view.events:
             if event.kind in _ENDINGS:
@@ -225,7 +228,7 @@ def wait_for_drain(
     The arguments are those of `wait_for_migration`.
     """
 
-    def look(on_wait: OnWait | None = None) -> WaitResult:
+    def look(on_wait: OnWait) -> WaitResult:
         view = master.list(
             hosts=True, processes=True, events=True, host=host, after=after, on_wait=on_wait
         )
@@ -244,7 +247,7 @@ def wait_for_drain(
 
 
 def _look_until(
-    look: Callable[..., WaitResult], timeout: float | None, notify: Notify
+    look: Callable[[OnWait], WaitResult], timeout: float | None, notify: Notify
 ) -> WaitResult:
     """Return the first result of `look` without pending names, or the last one in time."""
     deadline = deadline_after(timeout)

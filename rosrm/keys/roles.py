@@ -103,6 +103,7 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "list": _READERS,
     "explain": _READERS,
     "submit": _SUBMITTERS,
+    "apply": _SUBMITTERS,
     "cancel": _SUBMITTERS,
     "restart": _SUBMITTERS,
     "migrate": _SUBMITTERS,

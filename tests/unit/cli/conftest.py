@@ -80,6 +80,7 @@ class FakeClient:
     processes: list = field(default_factory=lambda: list(PROCESSES))
     plugins: list = field(default_factory=lambda: list(PLUGINS))
     events: list = field(default_factory=lambda: list(EVENTS))
+    applications: list = field(default_factory=list)
     trouble: str = ""
     security: str = "keys"
     strangers: str = ""
@@ -133,8 +134,8 @@ class FakeClient:
         self._note("explain", name)
         return STORY
 
-    def list(self, *, hosts=False, processes=False, plugins=False, events=False, process="",
-             host="", after=0, newest=0, on_wait=None):  # fmt: skip
+    def list(self, *, hosts=False, processes=False, plugins=False, applications=False,
+             events=False, process="", host="", after=0, newest=0, on_wait=None):  # fmt: skip
         if on_wait is not None:
             for seconds in self.waits:
                 on_wait(seconds)
@@ -147,6 +148,7 @@ class FakeClient:
             last_sequence=max((row.sequence for row in self.events), default=0),
             hosts=self.hosts if hosts else (), processes=self.processes if processes else (),
             plugins=[row for row in self.plugins if plugins and plugins in (True, row.state)],
+            applications=self.applications if applications else (),
             events=chosen[-(newest or 1000) :] if events else (),
         )  # fmt: skip
 

@@ -176,7 +176,7 @@ def test_ps_json_has_every_process_with_every_field(rosrm, client):
         "pid": 99, "restarts": 2, "migrations": 1, "exit_code": 0, "priority": 0,
         "queue_position": 0, "since": 12.0, "cpu": 0.5, "memory": 64_000_000, "reason": "",
         "stale": False, "owner": "", "cpu_limit": 0.0, "memory_limit": 0, "array": "",
-        "next_run": 0.0,
+        "next_run": 0.0, "application": "",
     }  # fmt: skip
 
 

@@ -546,8 +546,8 @@ def test_a_wrong_file_is_refused_with_its_place(refusal, text, said):
 def test_a_misspelt_section_is_one_error(refusal):
     said = refusal(load_work, "proceses: [{name: a, command: x}]")
     assert said == (
-        "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'? Allowed: processes, "
-        "defaults, group"
+        "f.yaml:1:1: unknown key 'proceses'; did you mean 'processes'? Allowed: app, "
+        "rollout, processes, defaults, group"
     )
 
 

@@ -26,7 +26,7 @@ def rows(cluster: Cluster, *, failing: bool = False) -> list[PluginRow]:
         "m", cluster.state, SimpleNamespace(last_sequence=0), [SELECTED],
         uptime=lambda: 0.0, core_now=lambda: cluster.now, trouble=lambda: "",
     )  # fmt: skip
-    asked = SimpleNamespace(hosts=0, processes=0, plugins=True, events=0, failing=failing)
+    asked = srv.List.Request(plugins=True, failing=failing)
     return list(reading.snapshot(asked, OPERATOR).plugins)
 
 
