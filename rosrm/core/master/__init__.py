@@ -9,6 +9,7 @@ requests.py    requests of clients; rights.py, quotas.py, contradictions.py, pro
 answers.py     answers of slaves to orders; reloading.py
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
 start_order.py starts after other processes, stops before them; dependants.py
+consequences.py the end of each step: what a change makes possible or necessary
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
 applications/  versions of applications, replacement of processes, plans
 scheduling/    choice of a host for a process: filter, score, pick

@@ -46,19 +46,16 @@ from rosrm.core.master import (
     pruning,
     reloading,
     requests,
-    start_order,
     tick,
 )
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import requests as application_requests
-from rosrm.core.master.assignment.assign import place_waiting
-from rosrm.core.master.assignment.gangs import recall_gangs
-from rosrm.core.master.cancellation import cancel_groups
 from rosrm.core.master.checkpoint import replication
 from rosrm.core.master.commands import Command, Reply
+from rosrm.core.master.consequences import follow_up
 from rosrm.core.master.hosts import registration
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration import executor, handoff
+from rosrm.core.master.migration import handoff
 from rosrm.core.master.outcomes import RequestRefused
 
 _Handler = Callable[[MasterState, Any, float], None]
@@ -112,11 +109,6 @@ def step(state: MasterState, event: happened.Event, now: float) -> list[Command]
     except RequestRefused as refusal:
         assert isinstance(event, happened.Request)
         state.emit(Reply(event.request, False, refusal.code, str(refusal)))
-    executor.advance_all(state, now)
-    cancel_groups(state, now)
-    start_order.review(state, now)
-    recall_gangs(state, now)
-    place_waiting(state, now)
-    cancel_groups(state, now)  # of which a process has failed, because no host can start it
+    follow_up(state, now)
     plugin_failures.note(state, now)
     return state.take()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.core.master import events as happened
+from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import RestartInstance, StopInstance
 from rosrm.model.values import (
     HostLossPolicy,
@@ -55,6 +56,15 @@ def test_a_process_starts_when_its_dependency_is_ready_and_blocks_no_other_until
     assert cluster.recorded("waits") == [f"viewer {why}"]
     cluster.discover("camera")
     assert cluster.phase("viewer") == "running"
+
+
+def test_a_job_of_an_array_starts_after_its_dependency_too() -> None:
+    """It enters the queue only when its array has a place for it."""
+    waits = job("j", start_order=after("camera"), array=ArrayMembership("r", 0, 1))
+    cluster = Cluster("a").with_processes(node("camera"), waits)
+    assert cluster["j"].reason == "waits for camera to be ready"
+    cluster.discover("camera")
+    assert cluster.phase("j") == "running"
 
 
 def test_a_process_starts_when_a_job_has_finished() -> None:

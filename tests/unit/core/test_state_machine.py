@@ -354,7 +354,7 @@ class Play(RuleBasedStateMachine):
     ) -> None:  # fmt: skip
         special = special and memory == 300
         specs = [
-            spec(one, kind, memory, moves, special, int(urgent), loss, devices, related)
+            spec(one, kind, memory, moves, special, int(urgent), loss, devices, related=related)
             for one in (name, twin)
         ]
         self.submit_all(specs)

@@ -6,15 +6,15 @@ from collections.abc import Callable, Iterable
 from copy import deepcopy
 from typing import Any, Final
 
-from rosrm.core.master import lifecycle, start_order
+from rosrm.core.master import lifecycle
 from rosrm.core.master.answers import order_answered
 from rosrm.core.master.applications import restart_policies, rollout
 from rosrm.core.master.applications.difference import changed_fields
-from rosrm.core.master.assignment.assign import place_waiting
 from rosrm.core.master.commands import Assign, Command, PublishStateConfig, SendOrder
+from rosrm.core.master.consequences import follow_up
 from rosrm.core.master.events import HandoffReported, OrderAnswered
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration import executor, handoff
+from rosrm.core.master.migration import handoff
 from rosrm.core.master.migration.preemption import preempt
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, Process, ProcessPhase
@@ -110,9 +110,7 @@ def _progress(state: MasterState) -> Any:
 def _settle(state: MasterState, now: float) -> None:
     """Place processes and advance migrations, while hosts carry out every order at once."""
     while True:
-        executor.advance_all(state, now)
-        start_order.review(state, now)
-        place_waiting(state, now)
+        follow_up(state, now)
         effects = [_carried_out(state, command, now) for command in state.take()]
         if not any(effects):
             return

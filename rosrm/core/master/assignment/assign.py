@@ -145,7 +145,6 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 
 def place_waiting(state: MasterState, now: float) -> None:
     """Assign queued processes until the head fits nowhere (`backfill`: until no process fits)."""
-    state.admit_from_arrays()
     if not len(state.queue) or state.placed_at == _versions(state):
         return
     head = state.queue.head()
