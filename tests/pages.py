@@ -60,6 +60,7 @@ RUN: Final[Mapping[str, Page]] = {
     "README.md": Page(),
     "docs/tutorials/first-cluster.md": Page(),
     "docs/how-to/limits-and-migration.md": Page(hosts=("robot-1", "robot-2")),
+    "docs/how-to/applications.md": Page(hosts=("robot-1", "robot-2")),
     "docs/how-to/stateful-node.md": Page(hosts=("desk", "shelf")),
     "docs/how-to/portable-node.md": Page(
         hosts=("robot",), cluster="migration: {strategies: [criu]}"
@@ -322,4 +323,4 @@ class Reader:
 
 
 #: Commands that change nothing, and are given again until they show what the page does.
-_LOOKS: Final = re.compile(r"rosrm (lab )?(ps|hosts|status|explain|events|logs|top)\b")
+_LOOKS: Final = re.compile(r"rosrm (lab )?(ps|hosts|status|explain|events|logs|top|apps|history)\b")
