@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -35,13 +36,19 @@ def listed() -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def podman(tmp_path_factory):
-    """Give podman a storage in a folder of the module's tests, with the image IMAGE."""
+def podman():
+    """Give podman a storage of its own, with the image IMAGE.
+
+    Below a long path, podman does not notice the end of a container for 20 s.
+    """
     busybox = shutil.which("busybox")
     if shutil.which("podman") is None or busybox is None:
         pytest.skip("podman and a static busybox are required")
-    folder = tmp_path_factory.mktemp("podman")
-    with pytest.MonkeyPatch.context() as monkeypatch:
+    with (
+        tempfile.TemporaryDirectory(prefix="podman-", ignore_cleanup_errors=True) as short,
+        pytest.MonkeyPatch.context() as monkeypatch,
+    ):
+        folder = Path(short)
         _configure(folder, monkeypatch)
         _pack_image(folder / "root.tar", busybox)
         _try("import", str(folder / "root.tar"), IMAGE)

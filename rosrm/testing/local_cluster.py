@@ -42,7 +42,7 @@ _DOMAINS: Final = range(1, 101)
 _PARTICIPANTS: Final = range(8)
 _LOOK: Final = 0.02
 #: Seconds for a master to start and to be discovered.
-_FIND: Final = 15.0
+_FIND: Final = 30.0
 
 
 def claim_domain() -> tuple[int, socket.socket]:

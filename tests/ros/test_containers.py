@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.model.values import Container, RestartPolicy
-from tests.podman_kit import IMAGE, listed, podman  # noqa: F401 - a fixture
+from tests.podman_kit import IMAGE, ask, listed, podman  # noqa: F401 - a fixture
 from tests.ros.clusters import CALM, STEADY, alive, host, node, service
 from tests.waiting import wait_until
 
@@ -59,7 +59,7 @@ def test_a_container_lives_as_long_as_its_process(make_cluster, tmp_path) -> Non
     assert cluster.wait("robot", "running").pid == pid
     cluster.cancel("robot")
     cluster.wait_for_log("robot", "interrupted")
-    wait_until(lambda: not listed(), "the container is removed")
+    wait_until(lambda: not listed(), "the container is removed", seen=lambda: ask("ps", "--all"))
     assert not processes_of("robot")
 
 
