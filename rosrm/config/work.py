@@ -15,7 +15,8 @@ from rosrm.config.groups import grouped
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
-from rosrm.config.process import ProcessInFile, about_retries, complaints
+from rosrm.config.process import ProcessInFile
+from rosrm.config.process_rules import about_retries, complaints
 from rosrm.config.rollout import RolloutInFile
 from rosrm.config.rules import (
     check_amounts,

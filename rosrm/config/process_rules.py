@@ -1,0 +1,297 @@
+"""Rules on a process entry of a work file, beyond the forms of its values."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from collections.abc import Set as AbstractSet
+from dataclasses import dataclass
+from typing import Any, Final
+
+from rosrm.model.arrays import INDEX_PLACEHOLDER
+from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER, artifacts_fault
+from rosrm.model.container_rules import container_fault
+from rosrm.model.description_checks import is_namespace, name_fault, other_process_fault
+from rosrm.model.devices import need_fault, unknown_placeholders
+from rosrm.model.job_checks import job_fault
+from rosrm.model.limits import limits_fault
+from rosrm.model.secret_rules import is_variable, secret_faults
+from rosrm.model.values import Kind, ProcessSpec, StartOrder
+from rosrm.wording import listed
+
+_NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
+_TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+_LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
+_ROS_ONLY: Final = ("namespace", "parameters", "remappings")
+
+
+@dataclass(frozen=True, slots=True)
+class Complaint:
+    """Violation of a rule: path of the wrong value in the entry, and a description."""
+
+    path: tuple[str, ...]
+    text: str
+
+
+def complaints(spec: ProcessSpec, wrong: AbstractSet[str]) -> Iterator[Complaint]:
+    """Yield every violation of a rule by the spec of an entry.
+
+    Args:
+        spec: unreadable values have their defaults.
+        wrong: keys whose values could not be read; rules that read them are skipped.
+    """
+    for rule, keys in _RULES:
+        if wrong.isdisjoint(keys):
+            yield from rule(spec)
+
+
+def _about_ros(spec: ProcessSpec) -> Iterator[Complaint]:
+    yield from _about_node(spec) if spec.ros else _about_others(spec)
+
+
+def _about_restarts(spec: ProcessSpec) -> Iterator[Complaint]:
+    if spec.restart.max_delay < spec.restart.delay:
+        text = "restart.max_delay must not be less than restart.delay"
+        yield Complaint(("restart", "max_delay"), text)
+
+
+def _about_ends(spec: ProcessSpec) -> Iterator[Complaint]:
+    if spec.time_limit and spec.kind != "job":
+        yield Complaint(("time_limit",), "time_limit: only a job has one; a service runs on")
+    if spec.reschedule.delay and not spec.reschedule.attempts:
+        text = "reschedule.delay requires `attempts`, the number of other hosts to try"
+        yield Complaint(("reschedule", "delay"), text)
+
+
+def _about_jobs(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = job_fault(spec)
+    if fault:
+        yield Complaint((fault.partition(":")[0],), fault)
+    texts = ("command", "arguments", "parameters", "remappings", "environment")
+    for key in texts if not spec.array.name else ():
+        found = INDEX_PLACEHOLDER.search(repr(getattr(spec, key)))
+        if found:
+            text = f"{key}: {found[0]} needs `array` in the process, such as `array: 1-100`"
+            yield Complaint((key,), text)
+
+
+def about_retries(spec: ProcessSpec, keys: AbstractSet[str]) -> Iterator[Complaint]:
+    """Yield the violations of the rules on `retries`, which is a short form of `restart`.
+
+    `keys`: those of the entry.
+    """
+    if "retries" in keys and "restart" in keys:
+        text = (
+            "retries is a short form of `restart: {when: on-failure, attempts: N}`; give only one"
+        )
+        yield Complaint(("retries",), text)
+    if "retries" in keys and spec.kind is not Kind.JOB:
+        text = "retries: only a job has it, and this process is a service; it has `restart`"
+        yield Complaint(("retries",), text)
+
+
+def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
+    standby = spec.standby
+    if standby.wanted and spec.kind == "job":
+        yield Complaint(("standby",), "a job runs to completion; only a service has a standby")
+    if standby.apart_by and not standby.wanted:
+        yield Complaint(("standby", "apart_by"), "standby.apart_by requires `wanted: true`")
+    if spec.isolation.after and spec.isolation.then == "keep":
+        yield Complaint(("isolation", "after"), "isolation.after requires `then: stop`")
+    if spec.host_loss.delay and spec.host_loss.then == "wait":
+        text = "host_loss.delay requires `then: elsewhere` or `then: stop`"
+        yield Complaint(("host_loss", "delay"), text)
+
+
+def _about_neighbours(spec: ProcessSpec) -> Iterator[Complaint]:
+    for rule in spec.neighbours:
+        key = rule.relation
+        if not rule.processes and not rule.group:
+            yield Complaint((key,), f"{key}: at least one process is required")
+        for name in rule.processes:
+            fault = other_process_fault(name, spec.name)
+            if fault:
+                yield Complaint((key,), f"{key}: {fault}")
+
+
+def _about_start_order(spec: ProcessSpec) -> Iterator[Complaint]:
+    order = spec.start_order
+    for name in order.after:
+        fault = other_process_fault(name, spec.name)
+        if fault:
+            yield Complaint(("after", name), f"after: {fault}")
+    if order != StartOrder() and not order.after:
+        text = "after: the name of at least one process is required"
+        yield Complaint(("after",), text)
+
+
+def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
+    for need in spec.devices:
+        fault = need_fault((need,))
+        if fault:
+            yield Complaint(("devices", need.kind), f"devices: {fault}")
+    kinds = [need.kind for need in spec.devices]
+    for key in ("arguments", "parameters"):
+        for kind in unknown_placeholders(repr(getattr(spec, key)), kinds):
+            yield Complaint(
+                (key,),
+                f"{key}: {{device.{kind}}} needs a device of the kind {kind!r}, which the process "
+                f"does not ask for; its `devices:` are {listed(kinds)}",
+            )
+
+
+def _about_artifacts(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = artifacts_fault(spec.artifacts)
+    if fault:
+        yield Complaint(("artifacts",), f"artifacts: {fault}")
+    for one in spec.artifacts:
+        if not one.source:
+            yield Complaint(("artifacts", one.name), f"artifacts.{one.name}: a path is required")
+    for key in _WITH_PLACEHOLDER if not spec.artifacts else ():
+        if ARTIFACTS_PLACEHOLDER in repr(getattr(spec, key)):
+            text = f"{key}: {ARTIFACTS_PLACEHOLDER} needs `artifacts:` in the process"
+            yield Complaint((key,), text)
+
+
+def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name in spec.talks_to:
+        fault = other_process_fault(name, spec.name)
+        if fault:
+            yield Complaint(("talks_to", name), f"talks_to: {fault}")
+
+
+def _about_gang(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = name_fault(spec.together, "gang") if spec.together else ""
+    if fault:
+        yield Complaint(("together",), f"together: {fault}")
+
+
+def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = limits_fault(spec)
+    if fault:
+        yield Complaint((fault.partition(".")[0].partition(":")[0],), fault)
+
+
+def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
+    health = spec.health
+    if bool(health.topic) != bool(health.rate):
+        text = "health.topic and health.rate (Hz, above 0) must be given together"
+        yield Complaint(("health",), text)
+    if health.topic and not _TOPIC.fullmatch(health.topic):
+        text = f"health.topic {health.topic!r} is no ROS topic; for example /scan, scan or ~/scan"
+        yield Complaint(("health", "topic"), text)
+    if health.lifecycle and health.lifecycle not in _LIFECYCLE:
+        text = f"health.lifecycle {health.lifecycle!r}; allowed: {', '.join(_LIFECYCLE)}"
+        yield Complaint(("health", "lifecycle"), text)
+    if (health.topic or health.lifecycle) and not spec.ros:
+        text = "health: only a ROS node has topics and a lifecycle; set `ros: true` if this is one"
+        yield Complaint(("health",), text)
+
+
+def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
+    programs = {
+        "package + executable": spec.package or spec.executable,
+        "module": spec.module,
+        "command": spec.command,
+    }
+    given = [name for name, value in programs.items() if value]
+    if len(given) != 1:
+        fault = f"{listed(given)} are given" if given else "no program is given"
+        yield Complaint((), f"{fault}; give one of package + executable, module or command")
+    elif spec.package and not spec.executable:
+        text = f"package {spec.package!r} is given without an executable"
+        yield Complaint(("package",), text)
+    elif spec.executable and not spec.package:
+        text = f"executable {spec.executable!r} is given without a package"
+        advice = "a program that is in no ROS package goes under `command`"
+        yield Complaint(("executable",), f"{text}; {advice}")
+
+
+def _about_others(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name in _ROS_ONLY:
+        if getattr(spec, name):
+            text = f"{name}: only a ROS node has one; set `ros: true` if this is one"
+            yield Complaint((name,), text)
+    if spec.readiness.kind == "graph":
+        text = "readiness: only a ROS node is seen in the graph"
+        yield Complaint(("readiness", "kind"), text)
+
+
+def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
+    if not _NODE_NAME.fullmatch(spec.name):
+        allowed = "at most 200 letters, digits and '_', the first of them not a digit"
+        text = f"{spec.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
+        if spec.array.name:
+            text += f"; write {{array.index}} into the name: {spec.array.name}_{{array.index}}"
+        yield Complaint(("name",), text)
+    if spec.namespace and not is_namespace(spec.namespace):
+        text = f"{spec.namespace!r} is not an absolute namespace such as '/robot1'"
+        yield Complaint(("namespace",), text)
+    for name, value in spec.parameters.items():
+        fault = _fault_of_parameter(value)
+        if fault:
+            yield Complaint(("parameters", *name.split(".")), f"parameters.{name}: {fault}")
+
+
+def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
+    directory = spec.working_directory
+    if directory == "":
+        text = 'working_directory: "" is no directory; leave it out for one of the process\'s own'
+        yield Complaint(("working_directory",), text)
+    for name, value in spec.environment.items():
+        if not is_variable(name, value):
+            yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
+
+
+def _about_secrets(spec: ProcessSpec) -> Iterator[Complaint]:
+    for name, fault in secret_faults(spec):
+        yield Complaint(("secrets", name), fault)
+
+
+def _about_container(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = container_fault(spec)
+    if fault:
+        yield Complaint(("container",), fault)
+
+
+def _fault_of_parameter(value: Any) -> str:
+    if value is None:
+        return "a value is required; ROS has no null"
+    items = value if isinstance(value, list) else [value]
+    kinds = {type(item) for item in items}
+    if kinds - {bool, int, float, str}:
+        return "a list in ROS parameters has only booleans, numbers or text"
+    if any(isinstance(item, float) and not math.isfinite(item) for item in items):
+        return "a finite number is required"
+    if any(isinstance(item, int) and not -(2**63) <= item < 2**63 for item in items):
+        return "a whole number of 64 bits is required, -2**63 to 2**63 - 1"
+    return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
+
+
+_Rule = Callable[[ProcessSpec], Iterator[Complaint]]
+_PROGRAM: Final = ("package", "executable", "module", "command")
+#: Fields in which `{artifacts}` stands for the directory of the artifacts.
+_WITH_PLACEHOLDER: Final = (
+    "command", "arguments", "parameters", "environment", "working_directory",
+)  # fmt: skip
+#: Each rule with the keys that it reads.
+_RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
+    (_about_program, _PROGRAM),
+    (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
+    (_about_surroundings, ("working_directory", "environment")),
+    (_about_secrets, ("secrets", "environment")),
+    (_about_container, ("container",)),
+    (_about_restarts, ("restart",)),
+    (_about_ends, ("time_limit", "kind", "reschedule")),
+    (_about_jobs, ("array", "parallel", "every", "at", "on", "kind")),
+    (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
+    (_about_health, ("health", "ros", *_PROGRAM)),
+    (_about_neighbours, ("name", "near", "apart", "spread")),
+    (_about_start_order, ("name", "after")),
+    (_about_devices, ("devices", "arguments", "parameters")),
+    (_about_artifacts, ("artifacts", *_WITH_PLACEHOLDER)),
+    (_about_flows, ("name", "talks_to")),
+    (_about_gang, ("together",)),
+    (_about_limits, ("limits", "cpus", "realtime", "needs")),
+)
