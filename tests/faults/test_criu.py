@@ -22,7 +22,7 @@ from tests.faults.handoff_watcher import instances
 from tests.ros.clusters import PATIENCE
 from tests.ros.portable_kit import NAME, Listener, ask, counter, nothing_left, two_hosts
 
-pytestmark = pytest.mark.timeout(180)
+pytestmark = pytest.mark.timeout(300)
 
 _OTHER = {"left": "right", "right": "left"}
 #: Bytes a second, so that a transfer takes a while.

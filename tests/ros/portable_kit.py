@@ -119,9 +119,9 @@ def found_below(cluster: Cluster, pattern: str) -> list[Path]:
             return sorted(cluster.directory.glob(f"hosts/*/images/{pattern}"))
 
 
-#: Seconds after which an image of an interrupted restore is removed: the strategy's timeouts for a
-#: start and a restore, and a margin.
-UNUSED = 90.0
+#: Seconds after which an image of an interrupted restore is removed, also if the slave was killed,
+#: and a margin.
+UNUSED = 140.0
 
 
 def nothing_left(cluster: Cluster, *, but: str = "?") -> None:

@@ -282,6 +282,17 @@ def test_that_it_was_restored_is_known_as_long_as_its_image_is_kept(slave, count
     assert not incoming(slave.state, 2).exists()
 
 
+def test_an_image_is_removed_whose_instance_ends_after_a_sweep(slave, counter, monkeypatch):
+    """A killed slave leaves an image whose instance its successor finds, and which then ends."""
+    monkeypatch.setattr(artifacts, "_LEFT_BEHIND", 0.1)
+    checkpointed(slave, counter)
+    slave.ask("take")
+    artifacts.sweep(slave.state, ["counter#2"])
+    eventually(lambda: not incoming(slave.state, 2).exists(), "the removal of the image")
+    steps.drop({"numbers": [1], "here": {"state": str(slave.state)}})
+    nothing_left(slave)
+
+
 def test_a_slave_that_was_started_again_keeps_the_ports(slave, counter):
     """A restarted slave reserves the ports of checkpointed processes; a drop releases them."""
     checkpointed(slave, counter)

@@ -177,10 +177,8 @@ def sweep(state: Path, instances: Iterable[str]) -> None:
             if number not in _senders:
                 discard(outgoing(state, number))
     forget_restored(state, instances)
-    here = set(map(number_of, instances))
     for number in numbers(state, "in"):
-        if number not in here:
-            remove_unused_later(incoming(state, number), _LEFT_BEHIND)
+        remove_unused_later(incoming(state, number), _LEFT_BEHIND)
 
 
 def forget_restored(state: Path, instances: Iterable[str]) -> None:
