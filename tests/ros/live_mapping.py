@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rosrm.errors import Refused
 from rosrm.model.values import Kind, ProcessSpec
@@ -63,14 +62,11 @@ class LiveMapping:
         """Check that the drive is not over yet."""
         assert self.cluster.process("player").state == "running", "the drive was over too early"
 
-    def finish(self, handoffs: int) -> dict[str, Any]:
+    def finish(self, handoffs: int) -> None:
         """End drive and SLAM, and check that each scan was mapped once, as by one instance.
 
         Args:
             handoffs: number of instances that took over from another one.
-
-        Returns:
-            the figures of the run, with the gap of each handoff.
         """
         received = self.observer.received
         self.wait_for_scans(3)
@@ -87,7 +83,6 @@ class LiveMapping:
         summary = summarise(run, unmigrated_poses(driven), len(run.parts) - 1)
         assert differences(summary, "full", migrations=handoffs) == [], summary
         assert (summary["scans_sent"], summary["scans_processed"]) == (sent, sent)
-        return {**summary, "gaps_ms": [round(1e3 * gap, 1) for gap in run.gaps()]}
 
 
 @contextmanager
