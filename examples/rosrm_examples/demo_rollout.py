@@ -130,16 +130,16 @@ def _write_results(out: Path, run: LiveRun, record: Record) -> dict[str, Any]:
 
 def _closing(summary: dict[str, Any], out: Path) -> str:
     gaps = ", ".join(f"{gap:.0f}" for gap in summary["gaps_ms"])
-    lines = [
+    scans = (
         f"{summary['scans_processed']} of {summary['scans_sent']} scans mapped: "
-        f"{summary['scans_lost']} lost, {summary['scans_repeated']} repeated",
+        f"{summary['scans_lost']} lost, {summary['scans_repeated']} repeated"
+    )
+    handoffs = (
         f"{summary['migrations']} handoffs of the SLAM, gaps of {gaps} ms beyond the period of "
         f"{summary['period_ms']:.0f} ms; at most {summary['max_deviation_m']} m from the run of "
-        "one instance",
-        "",
-        *(f"  {out / name}" for name in LEFT),
-    ]
-    return "\n".join(lines)
+        "one instance"
+    )
+    return "\n".join([scans, handoffs, "", *(f"  {out / name}" for name in LEFT)])
 
 
 if __name__ == "__main__":
