@@ -6,11 +6,11 @@ returns to the second one, also with the SLAM, which it had replaced already.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessSpec
+from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessSpec, RestartPolicy
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm_examples.demo_job import NODE_STOP
@@ -98,19 +98,16 @@ def _slam(live: LiveRollout, version: int) -> ProcessSpec:
 
 def _viewer(version: int) -> ProcessSpec:
     """Return a process without a state: the new one starts, then the old one stops."""
-    if version == 3:
-        command = ("sh", "-c", f"sleep {_VIEWER_ENDS_S}; exit 3")
-        return ProcessSpec(
-            name=VIEWER, command=command, migration=MigrationPolicy("relaunch"),
-            application=APPLICATION,
-        )  # fmt: skip
-    return ProcessSpec(
+    viewer = ProcessSpec(
         name=VIEWER,
         module="rosrm_examples.holder",
         arguments=("--mb", str(_VIEWER_MB[version])),
         migration=MigrationPolicy("relaunch"),
+        restart=RestartPolicy("on-failure"),
         application=APPLICATION,
     )
+    faulty = ("sh", "-c", f"sleep {_VIEWER_ENDS_S}; exit 3")
+    return replace(viewer, module="", arguments=(), command=faulty) if version == 3 else viewer
 
 
 def _recorder(version: int) -> ProcessSpec:

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf
+from typing import Final
 
 from rosrm import EventRow
 
 #: Step of a plan from which on the destination owns the name, as events call it.
-_COMMIT = "the commit"
+_COMMIT: Final = "the commit"
+#: Kinds of events that end the owner of a name.
+_ENDS: Final = ("backoff", "queued", "failed", "finished", "cancelled")
 
 
 @dataclass
@@ -130,9 +133,9 @@ class _Reader:
         elif event.kind == "instance_ended":
             for span in self._others(name):
                 span.end = min(span.end, at)
-        elif event.kind in ("queued", "failed", "finished", "cancelled") and owner:
-            owner.end = at
-            owner.failed = event.kind == "failed"
+        elif event.kind in _ENDS and owner:
+            owner.end = min(owner.end, at)
+            owner.failed |= event.kind in ("backoff", "failed")
 
     def _begin(self, event: EventRow, number: int) -> Span:
         version = self.rollout.requests[-1].version

@@ -39,8 +39,10 @@ EVENTS = (
     (10.2, "migration_step", "viewer", {"step": "the commit"}),
     (10.3, "instance_ended", "viewer", {}),
     (10.4, "migrated", "viewer", {}),
-    (11.0, "failed", "viewer", {}),
+    (11.0, "backoff", "viewer", {}),
     (11.1, "application_returns", "", {"version": 3}),
+    (11.1, "replaced", "viewer", {}),
+    (11.2, "queued", "viewer", {}),
     (11.2, "assigned", "viewer", {"number": 7}),
     (15.0, "application_applied", "", {"version": 2}),
 )
