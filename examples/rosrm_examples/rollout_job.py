@@ -14,6 +14,7 @@ from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessSpec, RestartPo
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm_examples.demo_job import NODE_STOP
+from rosrm_examples.demo_progress import Progress
 from rosrm_examples.demo_record import ENDED
 from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
@@ -38,8 +39,6 @@ _RECORDER_MB: Final = {1: 10, 2: 15, 3: 15}
 _MAP_EVERY: Final = {1: 10, 2: 5, 3: 4}
 #: Scans that are mapped before the next version is applied.
 _SCANS_BETWEEN: Final = 20
-#: Seconds without a pose after which nothing more is expected.
-_QUIET_S: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -144,24 +143,18 @@ class RolloutScript:
         self._reached: list[int] = []  # versions that the application was at, in order
         self._mapped_before = 0
         self._played = False
-        self._player_ended = False
-        self._mapped = 0
-        self._quiet_since = 0.0
-        self._elapsed = 0.0
+        self._progress = Progress(observer)
 
     def act(self, client: Client, elapsed: float) -> None:
         """Request what is due."""
-        self._elapsed = elapsed
-        mapped = len(self._observer.received)
-        if mapped > self._mapped:
-            self._mapped, self._quiet_since = mapped, elapsed
+        self._progress.look(elapsed)
         if self._is_due():
             self._applied += 1
-            self._quiet_since = elapsed
+            self._progress.note_action()
             client.apply_targets([target(self._live, self._applied)])
         elif self._reached and not self._played and self._observer.publishers():
             self._played = True
-            self._quiet_since = elapsed
+            self._progress.note_action()
             client.submit(player_spec(self._live))
 
     def _is_due(self) -> bool:
@@ -169,21 +162,21 @@ class RolloutScript:
         if self._applied == 0:
             return True
         done = self._applied == 3 or self._reached[-1:] != [self._applied]
-        return not done and self._mapped >= self._mapped_before + _SCANS_BETWEEN
+        return not done and self._progress.mapped >= self._mapped_before + _SCANS_BETWEEN
 
     def is_over(self, view: Listing) -> bool:
         """Return True if the last version was given up and every scan is mapped, or none comes."""
         for event in view.events:
             if event.kind == "application_applied":
                 self._reached.append(int(event.facts["version"]))
-                self._mapped_before = self._mapped
+                self._mapped_before = self._progress.mapped
         rows = {row.name: row for row in view.processes}
         player = rows.get(PLAYER)
         if player is None or player.state not in ENDED:
             return False
         is_settled = self._applied == 3 and len(self._reached) == 3
-        is_mapped = self._mapped >= len(self._live.drive)
-        return (is_settled and is_mapped) or self._elapsed - self._quiet_since >= _QUIET_S
+        ended = self._progress.has_ended(len(self._live.drive))
+        return ended if is_settled else self._progress.is_quiet()
 
     def progress(self, view: Listing) -> str:
         """Return the progress of the drive, and the version that is requested."""
@@ -191,6 +184,6 @@ class RolloutScript:
         moving = ", ".join(name for name, state in states.items() if state == "migrating")
         what = f", {moving} is replaced" if moving else ""
         return (
-            f"{self._mapped:4} of {len(self._live.drive)} scans mapped, "
+            f"{self._progress.mapped:4} of {len(self._live.drive)} scans mapped, "
             f"version {self._applied}{what}"
         )

@@ -21,7 +21,7 @@ class Span:
 
     Attributes:
         version: of the application.
-        begin: its host was told to start it.
+        begin: the master ordered its start.
         active: it owned the name of its process from then on; infinite: never.
         checked: the check of its health began; infinite: it was not checked.
         successor: another instance owned the name from then on; infinite: none.

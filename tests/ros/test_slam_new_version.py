@@ -1,4 +1,4 @@
-"""One drive, mapped live by an application whose SLAM is replaced by newer versions meanwhile."""
+"""One drive, mapped live by an application whose SLAM is replaced during the drive."""
 
 from __future__ import annotations
 

@@ -185,7 +185,7 @@ def test_at_most_max_parallel_processes_are_replaced_at_once() -> None:
 
 
 def test_a_process_in_back_off_waits_for_no_other_replacement() -> None:
-    """It does not run, so `max_parallel` does not count it."""
+    """`max_parallel` counts only processes that run."""
     cluster = Cluster("a")
     parts = [movable(name) for name in "pqr"]
     cluster.apply("nav", *parts)
