@@ -168,6 +168,7 @@ def test_a_stateful_process_hands_over_its_state_to_the_new_program() -> None:
     cluster.wait(8.0)
     starts = [one.assignment for one in cluster.orders(StartInstance)]
     assert [(one.shadow, one.spec.command) for one in starts] == [(True, ("new",))]
+    assert cluster.recorded("migrated") == ["p was replaced on a by its new version"]
     assert cluster.active("p") == ["a"]
 
 
