@@ -21,12 +21,12 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
-.PHONY: help setup environment check test lint format demo demo-migration bench evaluation fuzz clean
+.PHONY: help setup environment check test lint format demo demo-migration demo-rollout bench evaluation fuzz clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  %-16s%s\n", $$1, $$2 }' $(MAKEFILE_LIST)
-	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration), OUT=folder (evaluation), MINUTES=60 (fuzz)"
+	@echo "Variables: PYTHON=python3.12 (setup), LAYERS=\"unit ros\" ARGS=\"-k name\" (test), DRIVE=path (demo-migration, demo-rollout), OUT=folder (evaluation), MINUTES=60 (fuzz)"
 
 setup: SETUP := --tests
 setup: environment ## make .venv with all that the other targets need
@@ -60,6 +60,9 @@ demo: environment ## three hosts on this machine map a LiDAR drive: out/demo/
 
 demo-migration: environment ## a LiDAR drive is mapped while the SLAM moves to another host: out/migration/
 	@$(BIN)/python -m rosrm_examples.demo_migration --out out/migration $(if $(DRIVE),--drive "$(DRIVE)")
+
+demo-rollout: environment ## an application gets new versions while it maps a drive: out/rollout/
+	@$(BIN)/python -m rosrm_examples.demo_rollout --out out/rollout $(if $(DRIVE),--drive "$(DRIVE)")
 
 bench: setup ## all benchmarks; each ends with one line of JSON
 	@set -e; for name in $(BENCHMARKS); do echo "== $$name"; $(BIN)/python -m benchmarks.$$name; done

@@ -59,6 +59,7 @@ class Page:
 RUN: Final[Mapping[str, Page]] = {
     "README.md": Page(),
     "docs/tutorials/first-cluster.md": Page(),
+    "docs/tutorials/your-first-application.md": Page(),
     "docs/how-to/limits-and-migration.md": Page(hosts=("robot-1", "robot-2")),
     "docs/how-to/applications.md": Page(hosts=("robot-1", "robot-2")),
     "docs/how-to/stateful-node.md": Page(hosts=("desk", "shelf")),

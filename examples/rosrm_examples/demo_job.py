@@ -21,6 +21,8 @@ from rosrm.config.settings import (
 )
 
 HOSTS: Final = ("host1", "host2", "host3")
+#: The application of the processes that map the drive.
+APPLICATION: Final = "map"
 MEMORY_LIMIT: Final = 0.8
 #: Stop of a ROS node. On a busy machine its end may take more than the usual 10 s, and a node that
 #: is killed leaves its shared memory. `LocalCluster` waits 30 s for a slave and its processes.
@@ -78,10 +80,16 @@ class Scenario:
 
 @dataclass(frozen=True)
 class Arrival:
-    """Processes that are submitted together, `at` seconds after the beginning."""
+    """Processes that are requested together.
+
+    Attributes:
+        at: seconds after the beginning.
+        application: of which these are all processes; "": they are single processes.
+    """
 
     at: float
     specs: tuple[ProcessSpec, ...]
+    application: str = ""
 
 
 def budget_for(available: float) -> int:
@@ -118,7 +126,7 @@ def host_configs(budget: int, cores: int) -> list[HostConfig]:
 
 
 def arrivals(scenario: Scenario, out: Path, working_directory: Path) -> list[Arrival]:
-    """Return all submissions, in order of time.
+    """Return the application that maps the drive and all submissions, in order of time.
 
     Args:
         out: folder for the mapped pieces, absolute.
@@ -127,7 +135,7 @@ def arrivals(scenario: Scenario, out: Path, working_directory: Path) -> list[Arr
     pieces = tuple(
         _piece(scenario, number, out, working_directory) for number in range(1, scenario.pieces + 1)
     )
-    coming = [Arrival(0.0, pieces)]
+    coming = [Arrival(0.0, pieces, APPLICATION)]
     every = _ARRIVAL_S / scenario.pace
     for number, mb in enumerate(holder_sizes(scenario), start=1):
         coming.append(Arrival(number * every, (_holder(scenario, number, mb),)))
@@ -172,6 +180,7 @@ def _piece(scenario: Scenario, number: int, out: Path, working_directory: Path) 
         kind=Kind.JOB,
         needs={"memory": _PIECE_MB * 1e6},
         stop=NODE_STOP,
+        application=APPLICATION,
     )  # fmt: skip
 
 

@@ -25,7 +25,7 @@ from matplotlib.ticker import MaxNLocator
 
 USAGE_FILE: Final = "usage.png"
 
-_PAPER, _INK, _QUIET, _FAINT = "#fbfaf7", "#22303c", "#8b949c", "#e4e2db"
+PAPER, INK, QUIET, FAINT = "#fbfaf7", "#22303c", "#8b949c", "#e4e2db"
 _COLOURS: Final = ("#00798c", "#d1495b", "#c98a1b")
 _WAITING: Final = "#b9c3cc"
 #: Marker, size, line width and label for an assignment of each kind of process.
@@ -42,16 +42,16 @@ _ROWS: Final = (0.0, 0.32, -0.32)
 def draw_usage(path: Path, record: Record, title: str) -> None:
     """Draw the record as a .png: utilisation of memory, assignments, migrations, and the queue."""
     figure, (usage, lanes, queue) = plt.subplots(
-        3, 1, figsize=(11, 8.2), sharex=True, layout="constrained", facecolor=_PAPER,
+        3, 1, figsize=(11, 8.2), sharex=True, layout="constrained", facecolor=PAPER,
         height_ratios=(5, 2.2, 1.1),
     )  # fmt: skip
     _draw_memory(usage, record)
     _draw_lanes(lanes, record)
     _draw_queue(queue, record)
     for axes in (usage, lanes, queue):
-        _dress(axes)
-    figure.suptitle(title, color=_INK, x=0.056, ha="left")
-    queue.set_xlabel("elapsed time (s)", color=_INK)
+        dress(axes)
+    figure.suptitle(title, color=INK, x=0.056, ha="left")
+    queue.set_xlabel("elapsed time (s)", color=INK)
     queue.set_xlim(-1, max(_times(record)[-1], 1.0))
     figure.align_ylabels()
     figure.savefig(path, dpi=130)
@@ -78,18 +78,18 @@ def _draw_memory(axes: Axes, record: Record) -> None:
     times, limit = _times(record), 100 * record.limits["memory"]
     for host in record.hosts:
         axes.plot(times, memory_of(record, host), color=colour_of(record, host), lw=1.9, label=host)
-    axes.axhline(limit, color=_INK, lw=1.1, ls=(0, (6, 4)), label=f"limit {limit:.0f} %")
+    axes.axhline(limit, color=INK, lw=1.1, ls=(0, (6, 4)), label=f"limit {limit:.0f} %")
     _mark_limit_reached(axes, record, limit)
     for move in record.moves():
-        axes.axvline(move.elapsed - record.start, color=_QUIET, lw=0.9, ls=":")
+        axes.axvline(move.elapsed - record.start, color=QUIET, lw=0.9, ls=":")
     axes.set_ylim(0, 100)
-    axes.set_ylabel("memory utilisation (%)", color=_INK)
+    axes.set_ylabel("memory utilisation (%)", color=INK)
     handles, _ = axes.get_legend_handles_labels()
     handles += [
-        Line2D([], [], ls="", marker="v", color=_INK, label="limit reached"),
-        Line2D([], [], color=_QUIET, lw=0.9, ls=":", label="migration"),
+        Line2D([], [], ls="", marker="v", color=INK, label="limit reached"),
+        Line2D([], [], color=QUIET, lw=0.9, ls=":", label="migration"),
     ]
-    _legend(axes, handles=handles)
+    draw_legend(axes, handles=handles)
 
 
 def _mark_limit_reached(axes: Axes, record: Record, limit: float) -> None:
@@ -110,23 +110,23 @@ def _draw_lanes(axes: Axes, record: Record) -> None:
         at = move.elapsed - record.start
         axes.annotate(
             "", (at, lane[move.destination]), (at, lane[move.source]),
-            arrowprops={"arrowstyle": "-|>", "color": _INK, "lw": 1.3, "shrinkA": 0, "shrinkB": 0},
+            arrowprops={"arrowstyle": "-|>", "color": INK, "lw": 1.3, "shrinkA": 0, "shrinkB": 0},
         )  # fmt: skip
     axes.set_ylim(min(lane.values()) - 0.75, 0.75)
     axes.set_yticks([])
     handles: list[Line2D] = [
-        Line2D([], [], ls="", marker=marker, ms=size**0.5, mew=mew, color=_INK, label=words)
+        Line2D([], [], ls="", marker=marker, ms=size**0.5, mew=mew, color=INK, label=words)
         for marker, size, mew, words in _MARKS.values()
     ]
     handles.append(
-        Line2D([], [], ls="", marker=r"$\downarrow$", ms=9, color=_INK, label="migration")
+        Line2D([], [], ls="", marker=r"$\downarrow$", ms=9, color=INK, label="migration")
     )
-    _legend(axes, handles=handles, handletextpad=0.3, title="assignments")
+    draw_legend(axes, handles=handles, handletextpad=0.3, title="assignments")
 
 
 def _draw_lane(axes: Axes, record: Record, host: str, y: float) -> None:
     colour = colour_of(record, host)
-    axes.axhspan(y - 0.5, y + 0.5, color=_FAINT, alpha=0.55, zorder=0, linewidth=0)
+    axes.axhspan(y - 0.5, y + 0.5, color=FAINT, alpha=0.55, zorder=0, linewidth=0)
     axes.text(
         -0.008, y, host, color=colour, ha="right", va="center",
         transform=axes.get_yaxis_transform(),
@@ -153,26 +153,27 @@ def _draw_queue(axes: Axes, record: Record) -> None:
     waiting = [sample.waiting for sample in record.samples]
     axes.fill_between(_times(record), waiting, color=_WAITING, step="post", linewidth=0)
     axes.set_ylim(0, max(4, *waiting) * 1.15)
-    axes.set_ylabel("queue", color=_INK)
+    axes.set_ylabel("queue", color=INK)
     axes.yaxis.set_major_locator(MaxNLocator(nbins=3, integer=True))
 
 
-def _legend(axes: Axes, **options: Any) -> None:
+def draw_legend(axes: Axes, **options: Any) -> None:
     """Draw the legend above the axes, to the left."""
     legend = axes.legend(
-        frameon=False, labelcolor=_INK, ncols=7, loc="lower left", bbox_to_anchor=(-0.01, 0.985),
+        frameon=False, labelcolor=INK, ncols=7, loc="lower left", bbox_to_anchor=(-0.01, 0.985),
         columnspacing=1.6, alignment="left", **{"handlelength": 1.8, **options},
     )  # fmt: skip
-    legend.get_title().set_color(_INK)
+    legend.get_title().set_color(INK)
 
 
-def _dress(axes: Axes) -> None:
-    axes.set_facecolor(_PAPER)
-    axes.tick_params(colors=_QUIET, length=3)
+def dress(axes: Axes) -> None:
+    """Give axes the colours of all pictures, without a frame."""
+    axes.set_facecolor(PAPER)
+    axes.tick_params(colors=QUIET, length=3)
     axes.spines[["top", "right", "left"]].set_visible(False)
-    axes.spines["bottom"].set_color(_FAINT)
+    axes.spines["bottom"].set_color(FAINT)
     axes.set_axisbelow(True)
-    axes.grid(axis="y", color=_FAINT, lw=0.7)
+    axes.grid(axis="y", color=FAINT, lw=0.7)
 
 
 def main(arguments: Sequence[str]) -> int:

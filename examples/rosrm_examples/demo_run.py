@@ -12,6 +12,7 @@ from types import FrameType
 from typing import Final, Protocol
 
 from rosrm import Client, InstanceId, Listing, ProcessRow, RosrmError
+from rosrm.model.applications import Target
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival
@@ -70,15 +71,19 @@ class Script(Protocol):
 
 
 class Arrivals:
-    """A script that submits processes at their times, and ends when all of them have ended."""
+    """A script that requests processes at their times, and ends when all of them have ended."""
 
     def __init__(self, coming: Sequence[Arrival]) -> None:
         self._left = list(coming)
 
     def act(self, client: Client, elapsed: float) -> None:
-        """Submit the processes that are due."""
+        """Apply the applications, and submit the single processes, that are due."""
         while self._left and self._left[0].at <= elapsed:
-            client.submit(self._left.pop(0).specs)
+            arrival = self._left.pop(0)
+            if arrival.application:
+                client.apply_targets([Target(arrival.application, arrival.specs)])
+            else:
+                client.submit(arrival.specs)
 
     def is_over(self, view: Listing) -> bool:
         """Return True if all processes have been submitted and have ended."""

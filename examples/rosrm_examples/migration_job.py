@@ -16,6 +16,7 @@ import numpy as np
 from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessRow, ProcessSpec
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
 from rosrm_examples.demo_job import MEMORY_LIMIT, NODE_STOP
+from rosrm_examples.demo_progress import Progress
 from rosrm_examples.demo_record import ENDED
 from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
@@ -41,8 +42,6 @@ _SCANNER: Final = {"scanner": "yes"}
 _SHORTEST_S: Final = 20.0
 #: Part of the drive after which the recorder is submitted; the SLAM migrates soon after.
 _RECORDER_AT: Final = 0.15
-#: Seconds without a pose after which nothing more is expected.
-_QUIET_S: Final = 10.0
 
 
 @dataclass(frozen=True)
@@ -164,27 +163,23 @@ class MigrationScript:
         self._observer = observer
         self._rows: dict[str, ProcessRow] = {}
         self._submitted: set[str] = set()
-        self._quiet_since = 0.0
-        self._mapped = 0
-        self._elapsed = 0.0
+        self._progress = Progress(observer)
 
     def act(self, client: Client, elapsed: float) -> None:
         """Submit the processes that are due."""
-        self._elapsed = elapsed
-        mapped = len(self._observer.received)
-        if mapped > self._mapped:
-            self._mapped, self._quiet_since = mapped, elapsed
+        self._progress.look(elapsed)
         for spec in self._due():
             client.submit([spec])
             self._submitted.add(spec.name)
-            self._quiet_since = elapsed
+            self._progress.note_action()
 
     def _due(self) -> Sequence[ProcessSpec]:
+        scans = len(self._live.drive)
         if SLAM not in self._submitted:
             return [slam_spec(self._live)]
         if PLAYER not in self._submitted:
             return [player_spec(self._live)] if self._slam_listens() else []
-        if RECORDER not in self._submitted and self._mapped >= _RECORDER_AT * len(self._live.drive):
+        if RECORDER not in self._submitted and self._progress.mapped >= _RECORDER_AT * scans:
             return [recorder_spec()]
         return []
 
@@ -198,8 +193,7 @@ class MigrationScript:
         player = self._rows.get(PLAYER)
         if player is None or player.state not in ENDED or self._rows[SLAM].state == "migrating":
             return False
-        quiet = self._elapsed - self._quiet_since
-        return self._mapped >= len(self._live.drive) or quiet >= _QUIET_S
+        return self._progress.has_ended(len(self._live.drive))
 
     def progress(self, view: Listing) -> str:
         """Return the progress of the drive, and the host that maps it."""
@@ -208,4 +202,4 @@ class MigrationScript:
             return "the SLAM is to start"
         where = f"on {slam.host}" if slam.host else "on no host yet"
         moving = ", it moves" if slam.state == "migrating" else ""
-        return f"{self._mapped:4} of {len(self._live.drive)} scans mapped, {where}{moving}"
+        return f"{self._progress.mapped:4} of {len(self._live.drive)} scans mapped, {where}{moving}"

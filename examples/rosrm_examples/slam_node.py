@@ -23,7 +23,7 @@ if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback while the imports below run
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -104,13 +104,15 @@ class SlamNode(Node):
         return path
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(
+    arguments: Sequence[str] | None = None, make_node: Callable[[], SlamNode] = SlamNode
+) -> int:
     """Map until SIGINT or SIGTERM; return the exit status."""
     raw = list(sys.argv if arguments is None else ["slam_node", *arguments])
     stop = StopSignals()
     try:
         with ros_context(raw):
-            path = _map(stop)
+            path = _map(make_node, stop)
     except (ExampleError, OSError) as error:
         print(f"slam_node: {error}", file=sys.stderr)
         return 2
@@ -118,8 +120,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _map(stop: StopSignals) -> Path | None:
-    node = SlamNode()
+def _map(make_node: Callable[[], SlamNode], stop: StopSignals) -> Path | None:
+    node = make_node()
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     while stop.came is None:

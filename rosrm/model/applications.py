@@ -19,7 +19,7 @@ class RolloutPolicy:
     """Way in which changed processes are replaced.
 
     Attributes:
-        max_parallel: highest number of processes that are being replaced at the same time.
+        max_parallel: highest number of running processes that are being replaced at the same time.
         healthy_for: seconds for which a new instance must run without a restart.
         on_failure: treatment of a replacement that fails.
     """

@@ -11,7 +11,13 @@ from rosrm.core.master.commands import Reply
 from rosrm.model.applications import Action
 from rosrm.model.orders import SetRestartPolicy, StartInstance
 from rosrm.model.requester import Requester
-from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
+from rosrm.model.values import (
+    InstanceState,
+    InstanceStatus,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+)
 from tests.unit.core.cluster import Cluster, Machine, job, movable, process
 from tests.unit.core.test_handoffs import stateful
 
@@ -162,6 +168,7 @@ def test_a_stateful_process_hands_over_its_state_to_the_new_program() -> None:
     cluster.wait(8.0)
     starts = [one.assignment for one in cluster.orders(StartInstance)]
     assert [(one.shadow, one.spec.command) for one in starts] == [(True, ("new",))]
+    assert cluster.recorded("migrated") == ["p was replaced on a by its new version"]
     assert cluster.active("p") == ["a"]
 
 
@@ -176,6 +183,19 @@ def test_at_most_max_parallel_processes_are_replaced_at_once() -> None:
     assert [program(cluster, name) for name in "pqr"] == [("new",), ("run", "it"), ("run", "it")]
     cluster.wait(20.0)
     assert [program(cluster, name) for name in "pqr"] == [("new",)] * 3
+
+
+def test_a_process_in_back_off_waits_for_no_other_replacement() -> None:
+    """`max_parallel` counts only processes that run."""
+    cluster = Cluster("a")
+    parts = [movable(name) for name in "pqr"]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    failing = cluster.state.instances[cluster["r"].owner].id
+    cluster.report("a", InstanceStatus(failing, InstanceState.BACKOFF))
+    cluster.apply("nav", *map(new, parts), healthy_for=5.0)
+    cluster.wait(3.0)
+    assert [program(cluster, name) for name in "pqr"] == [("new",), ("run", "it"), ("new",)]
 
 
 def test_a_stateful_process_waits_for_room_and_a_stateless_one_is_stopped_first() -> None:

@@ -42,6 +42,8 @@ def test_the_holders_want_more_than_the_hosts_have(seed, budget):
 def test_the_pieces_come_first_and_everything_in_order_of_time():
     coming = arrivals(SCENARIO, Path("/out/pieces"), Path("/here"))
     assert [spec.name for spec in coming[0].specs] == [f"piece_{k:02d}" for k in range(1, 10)]
+    assert [arrival.application for arrival in coming[:2]] == ["map", ""]
+    assert {spec.application for spec in coming[0].specs} == {"map"}
     times = [arrival.at for arrival in coming]
     assert times[0] == 0.0
     assert times == sorted(times)

@@ -108,7 +108,8 @@ def _advance(
         return process.next_spec is None and _runs_well(state, application, task, process, now)
     if task.begun and process.name not in state.migrations:
         task.fault = task.fault or "its new version did not start"
-    elif not task.begun and may_replace:
+    # A process in back-off does not run: its replacement interrupts nothing.
+    elif not task.begun and (may_replace or process.phase is ProcessPhase.BACKOFF):
         _replace(state, application, task, process, spec, now)
     elif not task.begun:
         task.reason = "waits until other processes are replaced"

@@ -260,6 +260,8 @@ def ending_of(migration: Migration) -> tuple[EventKind, str]:
         if done:
             return EventKind.RESTORED, f"{name} was restored from its image on {here}"
         return EventKind.RESTORE_FAILED, f"{name} stays checkpointed on {here}: {migration.failure}"
+    if done and migration.spec is not None:
+        return EventKind.MIGRATED, f"{name} was replaced on {there} by its new version"
     if done:
         return EventKind.MIGRATED, f"{name} moved from {here} to {there}"
     return EventKind.STAYED, f"{name} stayed on {here}: {migration.failure}"
