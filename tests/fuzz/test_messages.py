@@ -7,6 +7,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -28,6 +29,16 @@ WORDS = st.sampled_from(
      "memory", "p", "run", "cordon"]
 ) | texts | json_values.map(json.dumps)  # fmt: skip
 SENDER = NoSecurity().peer("user:ada", 0)
+
+
+class Requests(services.MasterServices):
+    """The conversions of requests, without ROS; every artifact is stored."""
+
+    def __init__(self) -> None:
+        self._queries = SimpleNamespace(has_artifact=lambda digest, size: True)
+
+
+MASTER = Requests()
 FLOAT32S = st.sampled_from([0.0, 0.5, 1.0, float("nan"), float("inf"), -float("inf"), 3e38, -1.0])
 
 
@@ -72,7 +83,8 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "snapshot": (msg.SnapshotReport, convert.snapshot_from_msg),
     "restart": (msg.RestartPolicy, convert.restart_from_msg),
     "order": (srv.ControlHost.Request, order_from_msg),
-    "submit": (srv.Submit.Request, lambda one: services._submitted(one, 1, SENDER)),
+    "submit": (srv.Submit.Request, lambda one: MASTER._submitted(one, 1, SENDER)),
+    "apply": (srv.Apply.Request, lambda one: MASTER._applied(one, 1, SENDER)),
     "cancel": (srv.Cancel.Request, lambda one: services._cancelled(one, 1, SENDER)),
     "migrate": (srv.Migrate.Request, lambda one: services._migrated(one, 1, SENDER)),
     "host state": (srv.SetHostState.Request, lambda one: services._host_set(one, 1, SENDER)),
