@@ -15,6 +15,7 @@ MOST_COMPARED: Final = 1000
 #: Commands that list the names of a kind.
 _LISTED_BY: Final = {
     "process": "rosrm ps --all", "host": "rosrm hosts", "array": "rosrm ps --all --json",
+    "application": "rosrm apps",
 }  # fmt: skip
 _STANDING: Final = {
     "backoff": "is in back-off",
@@ -49,7 +50,7 @@ def no_such(kind: str, names: Sequence[str], known: Iterable[str]) -> str:
     """Return the refusal of unknown names, with the nearest known names or some of the known ones.
 
     Args:
-        kind: "process" or "host".
+        kind: key of `_LISTED_BY`.
         names: unknown names.
         known: known names of that kind; those after the first `MOST_COMPARED` are not compared.
     """

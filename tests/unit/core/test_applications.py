@@ -313,6 +313,16 @@ def test_a_cancelled_application_can_be_applied_again() -> None:
 # --- refusals ---------------------------------------------------------------------------------
 
 
+def test_an_unknown_application_is_refused_with_the_nearest_name() -> None:
+    """So is its cancellation; the refusal names the command that lists applications."""
+    cluster = Cluster("a")
+    cluster.apply("navigation", process("p"))
+    reply = cluster.apply("navigatin")
+    assert (reply.accepted, reply.code) == (False, "unknown")
+    assert "navigation" in reply.message
+    assert "`rosrm apps` lists them" in reply.message
+
+
 def test_a_name_of_another_application_is_refused_as_a_whole() -> None:
     """Nothing of the application starts."""
     cluster = Cluster("a").with_processes(process("single"))
