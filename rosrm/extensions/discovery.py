@@ -197,7 +197,7 @@ def _misspelt(plugin: object, marked: Mapping[str, Callable[..., Any]]) -> Itera
         unmarked = getattr(plugin, hook, None)
         if callable(unmarked) and hook not in marked:
             where = definition(unmarked)
-            yield f"{hook} ({where}) lacks the mark @hookimpl of rosrm.extensions.hookspecs"
+            yield f"{hook} ({where}) lacks the mark @hookimpl (`from rosrm import hookimpl`)"
 
 
 def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..., Any]) -> None:

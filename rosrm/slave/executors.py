@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, Final
 
 from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
 from rosrm.extensions.contracts import Executor
@@ -20,6 +20,8 @@ from rosrm.ros.slave.services import ExecutorOutcome
 
 _log = logging.getLogger("rosrm.slave")
 
+#: Marks an error that is too recent to forget, although a later call has succeeded.
+_SINCE: Final = "; it has succeeded since"
 #: Takes the outcome of an executor.
 Done = Callable[[ExecutorOutcome], None]
 
@@ -116,9 +118,14 @@ class Executors:
 
     def _work(self, strategy: str) -> None:
         failed_at = self._failed_at.get(strategy)
-        if failed_at is not None and self._clock() - failed_at >= WORKS_AFTER:
+        if failed_at is None:
+            return
+        if self._clock() - failed_at >= WORKS_AFTER:
             del self.failing[strategy], self._failed_at[strategy]
             self._changed(f"migration strategy {strategy} works again")
+        elif not self.failing[strategy].endswith(_SINCE):
+            self.failing[strategy] += _SINCE
+            self._changed(f"migration strategy {strategy} has succeeded since its last failure")
 
 
 def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> ExecutorOutcome:
