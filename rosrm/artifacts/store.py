@@ -210,7 +210,8 @@ class ArtifactStore:
             raise Refused(
                 f"the master has no room for an artifact of {sized(size)}: its store may have "
                 f"{sized(self._max_size)}, and {sized(stays)} are in use; remove ended processes "
-                "with `rosrm prune`, or raise `artifacts.max_size` in cluster.yaml",
+                "and cancelled applications with `rosrm prune`, or raise `artifacts.max_size` in "
+                "cluster.yaml",
                 "full",
             )
         old.sort(key=lambda digest: self._offered.get(digest, 0.0))

@@ -518,6 +518,8 @@ def note_phase(state: MasterState, process: Process, owner: Instance, now: float
     elif unreachable:
         lost = state.hosts.condition_of(host) is HostCondition.LOST
         reason = f"{host.name} {unreachable}{_what_follows(process) if lost else ''}"
+        if lost and process.awaits_gang:
+            state.gangs.leave(process)
         state.set_phase(process, ProcessPhase.UNREACHABLE, now, reason)
     else:
         state.set_phase(process, _phase_of(process, owner), now)

@@ -350,7 +350,7 @@ class MasterState:
             process.phase_before_loss = None
         process.phase = phase
         process.since, process.wall = began
-        if process.awaits_gang and phase not in BEFORE_START:
+        if process.awaits_gang and phase not in (*BEFORE_START, ProcessPhase.UNREACHABLE):
             self.gangs.leave(process)
         if ends_group(process):
             key = process.principal, process.spec.group.name
@@ -394,11 +394,12 @@ class MasterState:
         in_line = process.name in self.queue or process.name in self.queue.arrays
         if in_line:
             self.unqueue(process)
-        process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
-        process.demand = None
-        if process.awaits_gang:
+        awaits_gang = process.awaits_gang
+        if spec.together != process.spec.together:
+            awaits_gang = bool(spec.together) and (awaits_gang or in_line)
             self.gangs.leave(process)
-            process.awaits_gang = bool(spec.together)
+        process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
+        process.demand, process.awaits_gang = None, awaits_gang
         self.wants_standby.pop(process.name, None)
         self.time_limited.pop(process.name, None)
         self.scheduled.pop(process.name, None)
@@ -407,6 +408,7 @@ class MasterState:
         self._update_terminal(process)
         if in_line:
             self.put_in_queue(process)
+        self.queue.arrays.note_change(process)  # the bound of its array may be new
         self.start_orders.note_change(process.name)
         self.save(process)
 
@@ -422,9 +424,26 @@ class MasterState:
     def is_gone(self, process: Process) -> bool:
         """Return True if a terminal process may be removed.
 
-        Neither an instance nor a standby of it may run, and no live process starts after it.
+        Neither an instance nor a standby of it may run, no live process starts after it, and it is
+        no finished job that its application still wants: without it, the job would run again.
         """
-        return not self.may_run(process) and process.name not in self.start_orders.dependants
+        is_used = process.name in self.start_orders.dependants or self.is_wanted_job(process)
+        return not self.may_run(process) and not is_used
+
+    def is_wanted_job(self, process: Process) -> bool:
+        """Return True for a finished job of the desired version of an application."""
+        application = self.applications.get(process.spec.application)
+        finished = process.phase is ProcessPhase.FINISHED
+        return finished and application is not None and process.name in application.specs
+
+    def remove_application(self, application: Application) -> None:
+        """Remove a cancelled application with its versions from memory and journal."""
+        del self.applications[application.name]
+        self._unsaved_applications.pop(application.name, None)
+        for number in application.versions:
+            key = applications.key_of(application.name, number)
+            self.emit(Intent("version", key, None))
+        self.emit(Intent("application", application.name, None))
 
     def may_run(self, process: Process) -> bool:
         """Return True if an instance or a standby of a process may run."""

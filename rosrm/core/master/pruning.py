@@ -1,4 +1,4 @@
-"""Removal of ended processes and departed hosts from memory, journal and listings."""
+"""Removal of what has ended or left, from memory, journal and listings."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from rosrm.core.master.hosts.liveness import lease_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.requests import count, known_host, known_processes
+from rosrm.core.master.state.applications import Application
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
@@ -22,7 +23,10 @@ _DEPARTED: Final = (HostCondition.LEFT, HostCondition.DETACHED)
 
 
 def prune_requested(state: MasterState, event: happened.PruneRequested, now: float) -> None:
-    """Remove all named processes and hosts, or refuse; without names, all that ended or left."""
+    """Remove all named processes and hosts, or refuse; without names, all that ended or left.
+
+    Without names, cancelled applications are removed, too, with their versions.
+    """
     if event.names or event.hosts:
         processes, hosts = _named(state, event, now)
     else:
@@ -37,13 +41,27 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         hosts = [host for host in left if not _why_not_pruned_host(state, host, now)]
     for process in processes:
         state.remove_process(process.name)
+    applications = [] if event.names or event.hosts else _cancelled_applications(state, event.by)
+    for application in applications:
+        state.remove_application(application)
     left_running = [_prune_host(state, host, event.by, now) for host in hosts]
-    if processes:
-        state.record(now, EventKind.PRUNED, f"{count(len(processes))} removed", by=event.by)
     removed = [count(len(processes))] if processes else []
+    removed += [counted(len(applications), "application")] if applications else []
+    if removed:
+        state.record(now, EventKind.PRUNED, f"{listed(removed)} removed", by=event.by)
     removed += [counted(len(hosts), "host")] if hosts else []
     message = f"{listed(removed)} removed" if removed else "nothing to remove"
     state.emit(Reply(event.request, message="; ".join([message, *filter(None, left_running)])))
+
+
+def _cancelled_applications(state: MasterState, by: Requester) -> list[Application]:
+    """Return the cancelled applications without a process."""
+    used = {process.spec.application for process in state.processes.values()}
+    return [
+        one for one in state.applications.values()
+        if not one.wanted and not one.tasks and one.name not in used
+        and by.may_act_on(one.principal)
+    ]  # fmt: skip
 
 
 def _named(
@@ -70,6 +88,12 @@ def _why_not_pruned(state: MasterState, process: Process) -> str:
         names = list(state.start_orders.dependants[process.name])
         after = f"{each_of(names)} starts after {process.name}, and has not ended"
         return f"{after}; cancel {listed(names)} first"
+    if state.is_wanted_job(process):
+        name = process.spec.application
+        return (
+            f"{process.name} is a finished job of the application {name}, and would run again at "
+            f"the next `rosrm apply`; cancel {name}, or remove the job from its file first"
+        )
     return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
 
 

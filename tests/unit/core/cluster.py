@@ -49,6 +49,7 @@ from rosrm.model.plan import (
     Stop,
 )
 from rosrm.model.records import Intent, Record
+from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.values import (
     EMPTY,
     InstanceStatus,
@@ -324,13 +325,14 @@ class Cluster(World[Machine]):
         return self.ask(happened.SubmissionReceived, specs)
 
     def apply(
-        self, name: str, *specs: ProcessSpec, version: int = 0, plan: bool = False, **rollout: Any
-    ) -> Reply:
+        self, name: str, *specs: ProcessSpec, version: int = 0, plan: bool = False,
+        by: Requester = OPERATOR, **rollout: Any,
+    ) -> Reply:  # fmt: skip
         """Request a version of an application: of these processes, or an earlier one; or none."""
         parts = tuple(replace(spec, application=name) for spec in specs)
         policy = RolloutPolicy(**{"healthy_for": 1.0, **rollout})
         target = Target(name, parts, version, policy)
-        return self.ask(happened.ApplicationsRequested, (target,), plan)
+        return self.ask(happened.ApplicationsRequested, (target,), plan, by)
 
     def with_processes(self, *specs: ProcessSpec) -> Self:
         """Submit processes, and return the cluster."""

@@ -7,8 +7,10 @@ from typing import Any
 
 import pytest
 
+from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
 from rosrm.model.applications import Action
+from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import SetRestartPolicy, StartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
@@ -20,6 +22,8 @@ from rosrm.model.values import (
 )
 from tests.unit.core.cluster import Cluster, Machine, job, movable, process
 from tests.unit.core.test_handoffs import stateful
+
+ADA, BOB = Requester("user:ada"), Requester("user:bob")
 
 
 def actions(reply: Reply) -> dict[str, str]:
@@ -139,6 +143,62 @@ def test_ended_processes_start_again_but_finished_jobs_do_not() -> None:
     assert [cluster.phase(one.name) for one in parts] == ["finished", "running", "running"]
 
 
+def test_a_finished_job_does_not_run_again_for_a_change_in_place() -> None:
+    """Nor is there a new start to plan."""
+    cluster = Cluster("a")
+    cluster.apply("nav", job("done"))
+    cluster.finish("done")
+    assert actions(cluster.apply("nav", job("done", priority=7))) == {}
+    cluster.wait(1.0)
+    assert cluster.phase("done") == "finished"
+
+
+def test_the_number_of_jobs_of_an_array_at_a_time_changes_in_place() -> None:
+    """Running jobs run on, and others start up to the new number."""
+
+    def array(parallel: int) -> list[ProcessSpec]:
+        members = (ArrayMembership("sweep", index, parallel) for index in range(4))
+        return [job(f"sweep_{one.index}", array=one) for one in members]
+
+    cluster = Cluster("a")
+    cluster.apply("sweep", *array(1))
+    (first,) = [name for name in cluster.state.processes if cluster.where(name)]
+    owner = cluster[first].owner
+    assert set(actions(cluster.apply("sweep", *array(3))).values()) == {"change"}
+    cluster.wait(1.0)
+    running = [name for name in cluster.state.processes if cluster.where(name)]
+    assert (len(running), cluster[first].owner) == (3, owner)
+
+
+@pytest.mark.parametrize("remove", ["prune", "collect"])
+def test_a_finished_job_stays_as_long_as_its_application_wants_it(remove: str) -> None:
+    """Without it, the next apply of the same file would run the job again."""
+    cluster = Cluster("a", keep_ended=0)
+    cluster.apply("nav", job("done"))
+    cluster.finish("done")
+    if remove == "prune":
+        assert cluster.ask(happened.PruneRequested, (), ()).message == "nothing to remove"
+        refusal = cluster.ask(happened.PruneRequested, ("done",), ()).message
+        assert "done is a finished job of the application nav, and would run again" in refusal
+    cluster.wait(5.0)
+    assert actions(cluster.apply("nav", job("done"))) == {}
+
+
+def test_cancelled_applications_are_pruned() -> None:
+    """Their names and versions are free, in the journal too; those of other users stay."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), by=ADA)
+    cluster.apply("map", process("q"), by=BOB)
+    for name, owner in (("nav", ADA), ("map", BOB)):
+        cluster.apply(name, by=owner)
+    cluster.wait(2.0)
+    reply = cluster.ask(happened.PruneRequested, (), (), ADA)
+    assert reply.message == "1 process and 1 application removed"
+    assert list(cluster.state.applications) == ["map"]
+    assert list(cluster.intents["application"]) == ["map"]
+    assert list(cluster.intents["version"]) == ["1 map"]
+
+
 # --- replacement ------------------------------------------------------------------------------
 
 
@@ -213,6 +273,49 @@ def test_a_stateful_process_waits_for_room_and_a_stateless_one_is_stopped_first(
     assert "no host has room for the new version of p beside the old" in task.reason
 
 
+def test_the_same_request_in_the_middle_changes_nothing() -> None:
+    """The new version is watched for `healthy_for` from its start on, and given up if it fails."""
+    cluster = Cluster("a")
+    cluster.apply("nav", movable("p"))
+    cluster.wait(1.0)
+    for _ in range(2):
+        cluster.apply("nav", new(movable("p")), healthy_for=5.0)
+        cluster.wait(2.0)
+    cluster.finish("p", code=1)
+    cluster.wait(10.0)
+    assert (program(cluster, "p"), state_of(cluster)) == (("run", "it"), (1, []))
+    assert len(cluster.recorded("application_requested")) == 2
+
+
+def test_the_same_request_does_not_forget_a_replacement_that_has_begun() -> None:
+    """What is replaced when the request is repeated is watched as well."""
+    cluster = Cluster("a")
+    parts = [movable("p"), movable("q")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    for _ in range(2):
+        cluster.apply("nav", *map(new, parts), healthy_for=5.0)
+    cluster.wait(2.0)
+    cluster.finish("p", code=1)
+    cluster.wait(20.0)
+    assert [program(cluster, name) for name in "pq"] == [("run", "it")] * 2
+    assert state_of(cluster) == (1, [])
+
+
+def test_a_user_may_cancel_a_process_while_it_is_replaced() -> None:
+    """It does not start with its new program."""
+    cluster = Cluster("a")
+    cluster.machines["a"].stubborn.add("p")
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    cluster.apply("nav", new(process("p")))
+    cluster.cancel("p")
+    cluster.let_go("p")
+    cluster.wait(5.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("cancelled", [])
+    assert state_of(cluster) == (2, [])
+
+
 # --- failures ---------------------------------------------------------------------------------
 
 
@@ -232,6 +335,30 @@ def test_a_version_that_fails_is_given_up() -> None:
     (returned,) = cluster.recorded("application_returns")
     assert returned.startswith("nav returns from version 2 to 1: p: it failed")
     assert cluster.state.applications["nav"].versions[2].given_up
+
+
+@pytest.mark.parametrize("other", ["a single process", "another user's"])
+def test_a_return_takes_no_process_of_somebody_else(other: str) -> None:
+    """It waits for the name, which was free for a while, and uses it then."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), movable("q"), by=ADA)
+    cluster.wait(1.0)
+    cluster.apply("nav", new(movable("q")), by=ADA, healthy_for=5.0)
+    cluster.wait(3.0)
+    assert cluster.phase("p") == "cancelled"
+    owner = ADA if other == "a single process" else BOB
+    cluster.ask(happened.PruneRequested, ("p",), (), ADA)
+    assert cluster.ask(happened.SubmissionReceived, (process("p"),), owner).accepted
+    cluster.finish("q", code=1)
+    cluster.wait(10.0)
+    assert cluster["p"].spec.application == ""
+    assert cluster["p"].principal == owner.name
+    assert other in cluster.state.applications["nav"].tasks["p"].reason
+    cluster.cancel("p")
+    cluster.ask(happened.PruneRequested, ("p",), ())
+    cluster.wait(3.0)
+    assert (cluster["p"].spec.application, cluster.phase("p")) == ("nav", "running")
+    assert state_of(cluster) == (1, [])
 
 
 def test_an_instance_that_never_gets_ready_changes_nothing() -> None:
@@ -344,15 +471,28 @@ def test_a_process_of_an_application_is_not_submitted() -> None:
 
 def test_an_application_of_another_user_is_refused() -> None:
     """Only its owner and operators change an application."""
-    from rosrm.core.master import events as happened
-    from rosrm.model.applications import Target
-
     cluster = Cluster("a")
-    ada, bob = Requester("user:ada"), Requester("user:bob")
-    target = Target("nav", (replace(process("p"), application="nav"),))
-    assert cluster.ask(happened.ApplicationsRequested, (target,), False, ada).accepted
-    reply = cluster.ask(happened.ApplicationsRequested, (Target("nav"),), False, bob)
+    assert cluster.apply("nav", process("p"), by=ADA).accepted
+    reply = cluster.apply("nav", by=BOB)
     assert (reply.accepted, reply.code) == (False, "denied")
+
+
+def test_the_quota_of_an_application_is_its_owners() -> None:
+    """Also where an operator applies it."""
+    cluster = Cluster("a", quotas={ADA.name: {"processes": 1}})
+    cluster.apply("nav", process("p"), by=ADA)
+    reply = cluster.apply("nav", process("p"), process("q"))
+    assert (reply.accepted, reply.code) == (False, "quota")
+    assert "user:ada would exceed its quota" in reply.message
+
+
+def test_a_gang_of_an_application_is_its_owners() -> None:
+    """A gang that waits already is found also where an operator applies the application."""
+    cluster = Cluster("a")
+    huge = process("p", 20_000, together="pair"), process("q", 20, together="pair")
+    cluster.apply("nav", *huge, by=ADA)
+    reply = cluster.apply("nav", *huge, process("r", together="pair"))
+    assert (reply.accepted, reply.code) == (False, "name_taken")
 
 
 # --- a master that is killed ------------------------------------------------------------------
@@ -430,3 +570,19 @@ def test_a_plan_moves_with_a_change_of_its_strategy() -> None:
     cluster.apply("nav", process("p"))
     planned = cluster.apply("nav", process("p", migration=MigrationPolicy("relaunch")), plan=True)
     assert actions(planned) == {"p": "change"}
+
+
+def test_a_plan_leaves_out_what_others_wait_for() -> None:
+    """A process that waits anyway is no difference that the request makes."""
+    cluster = Cluster("a").with_processes(process("huge", 20_000))
+    cluster.apply("other", process("large", 30_000), by=BOB)
+    assert actions(cluster.apply("nav", process("p"), plan=True, by=ADA)) == {"p": "start"}
+
+
+def test_a_plan_writes_no_history() -> None:
+    """`explain` shows what happened, not what would."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    before = list(cluster["p"].history)
+    cluster.apply("nav", new(process("p")), plan=True)
+    assert cluster["p"].history == before

@@ -337,6 +337,39 @@ def test_a_gang_stays_one_after_a_restart_of_the_master() -> None:
     assert steps == [{"sensing-0", "sensing-1", "sensing-2"}]
 
 
+def test_an_assigned_process_stays_in_its_gang_over_a_restart_of_the_master() -> None:
+    """Its host registers again; if that host starts nothing, both are placed together again."""
+    cluster = cluster_of("ab", delivery_timeout=1.0, lease=30.0, suspect=20.0)
+    cluster.cut("a", "b")
+    cluster.submit(*gang(700, 700, host_loss=HostLossPolicy("elsewhere")))
+    assert phases(cluster) == ["assigned"] * 2
+    cluster.restart_master()
+    assert [cluster[name].awaits_gang for name in ("sensing-0", "sensing-1")] == [True] * 2
+    steps = steps_with_assignments(cluster)
+    for name in "ab":
+        cluster.rejoin(name)
+    cluster.wait(5.0)
+    assert phases(cluster) == ["running"] * 2
+    assert steps in ([], [{"sensing-0", "sensing-1"}])
+
+
+def test_a_waiting_process_can_get_another_gang() -> None:
+    """It leaves the former one, and waits for the other: by a change in place."""
+    cluster = cluster_of("a")
+    other = [process(f"o{i}", memory=300 * (1 + i), together="other") for i in range(3)]
+    alone = process("alone", memory=300)
+    cluster.cut("a")  # nothing is placed
+    cluster.state.hosts.by_name["a"].cordoned = True
+    parts = [*gang(300, 300), *other]
+    cluster.apply("nav", *parts, alone)
+    changed = [replace(one, together="other") for one in (parts[0], alone)]
+    cluster.apply("nav", changed[0], parts[1], *other, changed[1])
+    members = {key[1]: list(names) for key, names in cluster.state.gangs.members.items() if key}
+    assert sorted(members) == ["other", "sensing"]
+    assert members["sensing"] == ["sensing-1"]
+    assert sorted(members["other"]) == ["alone", "o0", "o1", "o2", "sensing-0"]
+
+
 def test_ended_processes_that_are_restarted_together_are_a_gang_again() -> None:
     """Restarted alone, a process is placed alone."""
     cluster = cluster_of("ab")

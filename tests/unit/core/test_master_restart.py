@@ -288,3 +288,14 @@ def test_a_host_is_expected_until_it_reports_to_a_restarted_master() -> None:
     cluster.wait(60.0)
     (row,) = listing.host_rows(cluster.state, cluster.now)
     assert row.state == "lost"
+
+
+def test_a_registered_host_has_the_reservations_of_its_processes_at_once() -> None:
+    """Otherwise the first decisions of a new master would overload the hosts."""
+    cluster = Cluster("a").with_processes(process("p", 6_000))
+    cluster.kill_master()
+    cluster.enter(cluster.machines["a"], 0, ())
+    host = cluster.state.hosts.by_name["a"]
+    (instance,) = cluster.state.instances_of(host)
+    memory = cluster.state.hosts.resources.index("memory")
+    assert instance.reserved[memory] > 0.3

@@ -13,12 +13,13 @@ from rosrm.model.applications import Action
 from rosrm.model.values import ProcessSpec
 
 #: Fields that only the master reads, and `restart`, whose change a slave can apply to a running
-#: instance. A change of any other field takes effect with the next start.
+#: instance. A change of any other field takes effect with the next start. (Of `array` only the
+#: number of jobs at a time changes: the index is part of the name.)
 IN_PLACE: Final = frozenset(
     {
         "restart", "needs", "required_labels", "preferred_labels", "avoided_labels", "priority",
         "migration", "neighbours", "talks_to", "reschedule", "protect", "time_limit",
-        "start_order", "group", "together",
+        "start_order", "group", "together", "array",
     }
 )  # fmt: skip
 _in_place_of: Final = attrgetter(*sorted(IN_PLACE))
@@ -84,9 +85,12 @@ def difference_of(
 
 
 def _of_ended(process: Process, spec: ProcessSpec) -> Difference | None:
-    """Return why an ended process is started again; None: it is a job that has finished."""
+    """Return why an ended process is started again; None: it is a job that has finished.
+
+    A change that needs no new start does not repeat a job.
+    """
     changed = changed_fields(process.spec, spec)
-    if process.phase is ProcessPhase.FINISHED and not changed:
+    if process.phase is ProcessPhase.FINISHED and IN_PLACE.issuperset(changed):
         return None
     return Difference(Action.START, changed, f"it is {process.phase.value} now")
 

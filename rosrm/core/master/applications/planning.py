@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from copy import deepcopy
+from dataclasses import replace
 from typing import Any, Final
 
 from rosrm.core.master import lifecycle
@@ -36,14 +37,16 @@ _REPORTS: Final = {
 
 
 def plan(
-    state: MasterState, change: Callable[[MasterState], None], now: float
-) -> tuple[tuple[PlannedAction, ...], list[str]]:
+    state: MasterState, change: Callable[[MasterState], None], requested: Collection[str],
+    now: float,
+) -> tuple[tuple[PlannedAction, ...], list[str]]:  # fmt: skip
     """Return the actions that follow a change, in order; the state does not change.
 
     Return also a sentence on each application that would return to its former version.
 
     Args:
         change: changes a copy of the state.
+        requested: names of the requested applications.
     """
     copy = copied(state)
     change(copy)
@@ -56,7 +59,7 @@ def plan(
         if is_new and newest is not None and newest.given_up:
             text = f"{name} would return to version {application.wanted}: {newest.given_up}"
             returns.append(text)
-    return tuple(_actions(state, copy)), returns
+    return tuple(_actions(state, copy, requested)), returns
 
 
 def copied(state: MasterState) -> MasterState:
@@ -66,13 +69,14 @@ def copied(state: MasterState) -> MasterState:
         state.chain_of, EMPTY,
     ]  # fmt: skip
     for process in state.processes.values():
-        shared += (process.spec, process.plain, process.decision, process.history, process.demand)
+        shared += (process.spec, process.plain, process.decision, process.demand)
     for host in state.hosts.hosts:
         shared.append(host.description)
     for application in state.applications.values():
         shared += application.versions.values()
     memo: dict[int, Any] = {id(one): one for one in shared}
     memo[id(state.rankings)], memo[id(state.demands)] = {}, {}
+    memo.update((id(one.history), list(one.history)) for one in state.processes.values())
     copy = deepcopy(state, memo)
     copy.rankings_version = -1
     return copy
@@ -152,13 +156,26 @@ def _hand_over(state: MasterState, command: PublishStateConfig, now: float) -> N
         handoff.handoff_reported(state, report, now)
 
 
-def _actions(before: MasterState, after: MasterState) -> Iterable[PlannedAction]:
-    """Yield the differences between two states, in order of submission."""
+def _actions(
+    before: MasterState, after: MasterState, requested: Collection[str]
+) -> Iterable[PlannedAction]:
+    """Yield the differences between two states, in order of submission.
+
+    Args:
+        requested: names of the requested applications. Of other processes only the moves are
+            differences that the request makes.
+    """
     names = dict.fromkeys((*before.processes, *after.processes))
     for name in names:
-        action = _action(before, before.processes.get(name), after, after.processes[name])
-        if action is not None:
+        old, new = before.processes.get(name), after.processes[name]
+        action = _action(before, old, after, new)
+        if action is None:
+            continue
+        if action.application in requested:
             yield action
+        elif action.action is Action.MOVE and action.before:
+            # Its details are for its owner alone.
+            yield replace(action, waits=action.waits.partition("\n")[0], decision=None)
 
 
 def _action(
@@ -166,9 +183,10 @@ def _action(
 ) -> PlannedAction | None:
     was, becomes = _host_of(before, old), _host_of(after, new)
     decision = new.decision if old is None or new.decision is not old.decision else None
-    waits = new.reason if new.phase in WAITING else _task_reason(after, new)
+    pending = _task_reason(after, new)
+    waits = new.reason if new.phase in WAITING else pending
     kind = _kind(old, new, was, becomes)
-    if kind is None and not waits:
+    if kind is None and not pending:
         return None
     return PlannedAction(
         new.name, kind or Action.REPLACE, new.spec.application, becomes, was,

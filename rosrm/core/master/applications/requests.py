@@ -48,7 +48,10 @@ def applications_requested(
     """Make the requested versions the desired ones, or reply with the plan of that."""
     prepared = _prepared(state, event)
     if event.plan_only:
-        actions, returns = plan(state, lambda copy: _execute(copy, event, prepared, now), now)
+        names = {one.application.name for one in prepared}
+        actions, returns = plan(
+            state, lambda copy: _execute(copy, event, prepared, now), names, now
+        )
         message = "; ".join((_summary(prepared), *returns))
         state.emit(Reply(event.request, message=message, actions=actions))
         return
@@ -197,8 +200,11 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
     fault = fault or _start_order_fault(state, prepared)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
-    check_gangs(state, started, by.name)
-    check_quota(state, started, by)
+    for one in prepared:  # an operator may apply the application of a user
+        owner = one.application.principal
+        own = [spec for spec in started if spec.application == one.application.name]
+        check_gangs(state, own, owner)
+        check_quota(state, own, by if owner == by.name else Requester(owner))
 
 
 def _start_order_fault(state: MasterState, prepared: Iterable[Prepared]) -> str:
@@ -224,9 +230,8 @@ def _want(state: MasterState, one: Prepared, by: Requester, now: float) -> None:
             one.application.name, by.name
         )
     number = 0 if version is None else version.number
-    unchanged = number == application.wanted and not one.found
-    if unchanged and not application.tasks:
-        return
+    if number == application.wanted and not one.found and not application.paused:
+        return  # what is not done yet goes on
     if version is not None and version.number > application.newest:
         application.newest = version.number
         state.save_version(application, version)

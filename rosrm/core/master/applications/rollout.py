@@ -21,6 +21,7 @@ A step that fails leads back to the former version of the application, unless th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from math import inf
 from typing import Final
@@ -38,7 +39,7 @@ from rosrm.core.master.state.process import WAITING, DesiredState, Process, Proc
 from rosrm.model.applications import Action
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.requester import Requester
-from rosrm.model.values import Kind, ProcessSpec
+from rosrm.model.values import EMPTY, Kind, ProcessSpec
 from rosrm.wording import counted
 
 #: Phases of a process that runs in any way that its slave reports.
@@ -98,6 +99,9 @@ def _advance(
 ) -> bool:  # fmt: skip
     """Take the next step for one desired process; return True if the process is as desired."""
     process = state.processes.get(spec.name)
+    task.reason = _why_not_own(application, process)
+    if task.reason:
+        return False
     if process is None or process.phase.is_terminal:
         return _advance_ended(state, application, task, process, spec, now)
     if process.wanted is DesiredState.CANCEL:
@@ -124,15 +128,38 @@ def _advance_ended(
     if process is not None and state.may_run(process):
         task.reason = "waits until its former instance has ended"
         return False
-    if process is not None and task.begun and process.spec == spec:
-        if process.phase is ProcessPhase.FAILED:
+    if task.begun and _has_ended(process, spec):
+        if process is not None and process.phase is ProcessPhase.FAILED:
             task.fault = f"it failed: {process.reason}"
-        return not task.fault  # finished, or cancelled by a user since
+        return not task.fault
     _begin(state, application, task)
     version = application.version
     defaulted = version.defaulted.get(spec.name, ()) if version is not None else ()
     add_process(state, spec, defaulted, Requester(application.principal), now)
     return False
+
+
+def _why_not_own(application: Application, process: Process | None) -> str:
+    """Return why a name cannot be used for now; "" if it can."""
+    if process is None:
+        return ""
+    if process.principal != application.principal:
+        return "waits until the process of this name, which is another user's, is removed"
+    if process.spec.application != application.name and not process.phase.is_terminal:
+        other = process.spec.application
+        whose = f"of the application {other}" if other else "a single process"
+        return f"waits until the process of this name, which is {whose}, has ended"
+    return ""
+
+
+def _has_ended(process: Process | None, spec: ProcessSpec) -> bool:
+    """Return True if the action on a process has had its effect, and the process has ended since.
+
+    A process that somebody has cancelled or removed in between does not start again.
+    """
+    if process is None or process.phase is ProcessPhase.CANCELLED:
+        return True
+    return process.spec == spec
 
 
 def _begin(state: MasterState, application: Application, task: Task) -> None:
@@ -232,24 +259,35 @@ def _handle_fault(
 
 
 def want(state: MasterState, application: Application, number: int, now: float) -> None:
-    """Make a version the desired one on request, and begin the work on it; 0: no version."""
+    """Make a version the desired one on request, and begin the work on it; 0: no version.
+
+    Work on the desired version goes on if the same is requested again.
+    """
+    same = number == application.wanted
     # The version before may be one that was not reached yet.
-    former = application.former if application.tasks else application.wanted
-    _set_wanted(state, application, number, now, former=former if number else 0)
+    former = application.former if application.tasks or same else application.wanted
+    going_on = application.tasks if same and not application.paused else {}
+    _set_wanted(state, application, number, now, former=former if number else 0, tasks=going_on)
 
 
 def _set_wanted(
-    state: MasterState, application: Application, number: int, now: float, *, former: int
-) -> None:
+    state: MasterState, application: Application, number: int, now: float, *, former: int,
+    tasks: Mapping[str, Task] = EMPTY,
+) -> None:  # fmt: skip
+    """Begin the work on a version.
+
+    Args:
+        former: number of the version to which a failure leads back; 0: none.
+        tasks: work that goes on.
+    """
     application.returning = bool(application.former and not former and number)
     application.wanted, application.former, application.paused = number, former, ""
     names = state.names_of(application.name)
     found = differences(state, application.name, application.specs, names)
     ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]
     order = dict.fromkeys([one.name for one in dependants_first(state, ending)]) | found
-    application.tasks = {
-        name: Task(replaces=found[name].action is Action.REPLACE) for name in order
-    }
+    begun = {name: Task(replaces=found[name].action is Action.REPLACE) for name in order}
+    application.tasks = {**begun, **tasks}
     state.save_application(application)
     _review(state, application, now)
 

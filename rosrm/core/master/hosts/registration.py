@@ -76,6 +76,8 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     for instance in stopping:  # the former run of the slave may not have carried out the order
         if instance.id.number in state.instances:
             lifecycle.stop_instance(state, instance, now)
+    for instance in state.instances_of(host):  # restored before the host's capacities were known
+        settle_reservation(state, instance, now)
     _clear_exclusions(state, host)
     _execute_again(state, host)
     reconsider_set_aside(state, now)
