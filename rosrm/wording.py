@@ -15,7 +15,7 @@ MOST_COMPARED: Final = 1000
 #: Commands that list the names of a kind.
 _LISTED_BY: Final = {
     "process": "rosrm ps --all", "host": "rosrm hosts", "array": "rosrm ps --all --json",
-    "application": "rosrm apps",
+    "application": "rosrm apps", "mode": "rosrm mode",
 }  # fmt: skip
 _STANDING: Final = {
     "backoff": "is in back-off",

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from rosrm.artifacts.store import ArtifactStore
+from rosrm.config.placement import settings_of_chain
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import (
@@ -184,6 +185,7 @@ class MasterRuntime:
         )
         state.plugins.limit = self._deadlines
         state.chain_of = self._reload.chain_of
+        state.scoring = state.scoring_in_force = settings_of_chain(self._config)
         state.wall = time.time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
@@ -256,11 +258,15 @@ class MasterRuntime:
         return time.monotonic()
 
     def _used_artifacts(self) -> frozenset[str]:
-        """Return the digests of the artifacts of all processes and kept versions."""
+        """Return the digests of the artifacts of all processes, kept versions and modes."""
         applications = self._state.applications.values()
         kept = [one for known in applications for one in known.versions.values()]
         specs = [known.spec for known in self._state.processes.values()]
         specs += [spec for version in kept for spec in version.specs.values()]
+        specs += [
+            spec for mode in self._state.modes.known.values()
+            for target in mode.targets for spec in target.specs
+        ]  # fmt: skip
         return frozenset(one.digest for spec in specs for one in spec.artifacts)
 
     def _post(self, call: Callable[[], None]) -> None:

@@ -92,6 +92,13 @@ class EventKind(str, Enum):
     APPLICATION_RETURNS = "application_returns", "a version failed: the former one is applied again"
     APPLICATION_CANCELLED = "application_cancelled", "all processes of the application have ended"
 
+    # --- modes ---------------------------------------------------------------------------
+
+    MODES_LOADED = "modes_loaded", "an operator loads modes"
+    MODE_BEGINS = "mode_begins", "the cluster switches to a mode, with the reason"
+    MODE_REACHED = "mode_reached", "all applications of the mode are as desired"
+    MODE_FAILED = "mode_failed", "a mode cannot be reached, with the reason"
+
     # --- hosts ---------------------------------------------------------------------------
 
     HOST_REGISTERED = "host_registered", "a host registered; facts: labels, resources and devices"

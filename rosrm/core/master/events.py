@@ -19,6 +19,7 @@ from rosrm.extensions.placement import PolicySettings
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.model.applications import Target
 from rosrm.model.devices import Device
+from rosrm.model.modes import Mode
 from rosrm.model.plan import ReportPhase
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.rows import PluginKind
@@ -187,6 +188,29 @@ class ApplicationsRequested:
 
     request: int
     targets: tuple[Target, ...]
+    plan_only: bool = False
+    by: Requester = OPERATOR
+
+
+@dataclass(frozen=True, slots=True)
+class ModesLoaded:
+    """An operator replaces the modes."""
+
+    request: int
+    modes: tuple[Mode, ...]
+    by: Requester = OPERATOR
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRequested:
+    """An operator requests a mode.
+
+    Attributes:
+        plan_only: True: the reply has the actions that would follow, and none begins.
+    """
+
+    request: int
+    mode: str
     plan_only: bool = False
     by: Requester = OPERATOR
 
@@ -398,6 +422,8 @@ class TimePassed:
 ClientRequest = (
     SubmissionReceived
     | ApplicationsRequested
+    | ModesLoaded
+    | ModeRequested
     | CancelRequested
     | RestartRequested
     | MigrationRequested

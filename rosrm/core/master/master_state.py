@@ -29,6 +29,7 @@ from rosrm.core.master.state.lazy import Plain
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration, migration_to_dict
+from rosrm.core.master.state.modes import Modes, mode_to_dict, modes_to_dict
 from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
@@ -48,10 +49,11 @@ from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.core.master.state.start_orders import StartOrders
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
-from rosrm.extensions.placement import ChainOf, PlacementPlugins
+from rosrm.extensions.placement import ChainOf, PlacementPlugins, PolicySettings
 from rosrm.model.codec import to_plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.modes import Mode
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
 from rosrm.model.requester import OPERATOR, Requester
@@ -105,6 +107,7 @@ class MasterState:
         time_limited: names of the processes with a time limit that are not terminal.
         scheduled: names of the processes with a schedule that are not terminal.
         applications: by name.
+        modes: sets of applications, and the one in force.
         terminal: names of the terminal processes, in the order in which they ended.
         unamended: name of each process whose slave does not know its new restart policy yet, to the
             time of the last order.
@@ -119,6 +122,8 @@ class MasterState:
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
         chain_of: creates the scoring policies with other settings; None: they stay.
+        scoring: settings of the scoring policies, without the weights of a mode.
+        scoring_in_force: the same with these weights.
         reloads: requests to reload, and the answers to them.
         plugins: guards every call of a plugin.
     """
@@ -141,6 +146,7 @@ class MasterState:
         self.queue = Queue()
         self.processes: dict[str, Process] = {}
         self.applications: dict[str, Application] = {}
+        self.modes = Modes()
         self.terminal: dict[str, None] = {}
         self.ended_members: dict[tuple[str, str], str] = {}
         self.instances: dict[int, Instance] = {}
@@ -162,6 +168,8 @@ class MasterState:
         self.rebalancing = Rebalancing()
         self.reloads = Reloads()
         self.chain_of: ChainOf | None = None
+        self.scoring: tuple[PolicySettings, ...] = ()
+        self.scoring_in_force: tuple[PolicySettings, ...] = ()
         self.unowned_instances: dict[str, set[int]] = {}
         self.rankings: dict[RankingKey, Ranking] = {}
         self.rankings_version = 0
@@ -301,6 +309,14 @@ class MasterState:
         self.emit(Intent("version", key_of(application.name, version.number), plain))
         for dropped in application.keep(self.settings.keep_versions):
             self.emit(Intent("version", key_of(application.name, dropped), None))
+
+    def save_modes(self) -> None:
+        """Persist which mode is in force, and the progress of a switch."""
+        self.emit(Intent("cluster", "modes", modes_to_dict(self.modes)))
+
+    def save_mode(self, name: str, mode: Mode | None) -> None:
+        """Persist a mode; None: it is removed."""
+        self.emit(Intent("mode", name, None if mode is None else mode_to_dict(mode)))
 
     def send(self, host: Host, order: Order, purpose: Purpose | None = None) -> OrderId:
         """Send an order to the slave of a host and return its id.

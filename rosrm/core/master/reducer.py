@@ -13,6 +13,8 @@ UsagesReceived          lowers reservations by the usage that readings now show
 SnapshotsReported       replaces the known snapshots and replicas of a host
 SubmissionReceived      queues all submitted processes, or refuses all; places queued processes
 ApplicationsRequested   makes versions of applications the desired ones, or plans that
+ModesLoaded             replaces the modes of the cluster
+ModeRequested           switches to a mode, or plans that
 CancelRequested         removes processes from the queue, or stops them
 RestartRequested        restarts running processes in place, or queues ended ones again
 MigrationRequested      begins a migration
@@ -56,6 +58,7 @@ from rosrm.core.master.consequences import follow_up
 from rosrm.core.master.hosts import registration
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import handoff
+from rosrm.core.master.modes import switching
 from rosrm.core.master.outcomes import RequestRefused
 
 _Handler = Callable[[MasterState, Any, float], None]
@@ -75,6 +78,8 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         happened.AssignmentWithdrawn: lifecycle.assignment_withdrawn,
         happened.SubmissionReceived: requests.submission_received,
         happened.ApplicationsRequested: application_requests.applications_requested,
+        happened.ModesLoaded: switching.modes_loaded,
+        happened.ModeRequested: switching.mode_requested,
         happened.CancelRequested: requests.cancel_requested,
         happened.RestartRequested: requests.restart_requested,
         happened.MigrationRequested: requests.migration_requested,

@@ -6,11 +6,10 @@ first: if it is refused, no slave reads its own.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import ReadSettings, Reply
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.modes.settings import apply_settings
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.pending_orders import Reload
@@ -51,8 +50,9 @@ def settings_read(state: MasterState, event: happened.SettingsRead, now: float) 
 def _apply(state: MasterState, event: happened.SettingsRead) -> None:
     assert event.settings is not None
     state.settings = event.settings
-    if "scoring" in event.changed and state.chain_of is not None:
-        state.placement = replace(state.placement, chain=state.chain_of(event.scoring))
+    if "scoring" in event.changed:
+        state.scoring = event.scoring
+        apply_settings(state)
     for process in state.processes.values():
         process.demand = None  # needs and defaults may have changed
     state.hosts.changed()

@@ -22,6 +22,7 @@ from rosrm.core.master.migration.preemption import preempt
 from rosrm.core.master.migration.rebalancing import review_rebalancing
 from rosrm.core.master.migration.reunion import review_separated
 from rosrm.core.master.migration.standby import review_standbys
+from rosrm.core.master.modes import switching
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.schedules import review_schedules
 from rosrm.core.master.start_order import review_stops
@@ -47,6 +48,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
         _review_instance(state, instance, now)
     restart_policies.review(state, now)
     rollout.review(state, now)
+    switching.review(state, now)
     review_time_limits(state, now)
     review_schedules(state, now)
     review_stops(state, now)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from rosrm.core.master import lifecycle
@@ -36,13 +36,28 @@ _REPORTS: Final = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """What follows a change.
+
+    Attributes:
+        actions: in order.
+        returns: a sentence on each application that would return to its former version.
+        obstacles: phrases on the processes that would find no host, and the returns.
+        message: a summary.
+    """
+
+    actions: tuple[PlannedAction, ...]
+    returns: tuple[str, ...]
+    obstacles: tuple[str, ...]
+    message: str = ""
+
+
 def plan(
     state: MasterState, change: Callable[[MasterState], None], requested: Collection[str],
     now: float,
-) -> tuple[tuple[PlannedAction, ...], list[str]]:  # fmt: skip
-    """Return the actions that follow a change, in order; the state does not change.
-
-    Return also a sentence on each application that would return to its former version.
+) -> Outlook:  # fmt: skip
+    """Return what follows a change; the state does not change.
 
     Args:
         change: changes a copy of the state.
@@ -51,15 +66,31 @@ def plan(
     copy = copied(state)
     change(copy)
     _run(copy, now)
-    returns = []
-    for name, application in copy.applications.items():
+    returns = tuple(_returns(state, copy))
+    obstacles = (*returns, *_without_host(copy, requested))
+    return Outlook(tuple(_actions(state, copy, requested)), returns, obstacles)
+
+
+def _returns(before: MasterState, after: MasterState) -> Iterable[str]:
+    for name, application in after.applications.items():
         newest = application.versions.get(application.newest)
-        known = state.applications.get(name)
+        known = before.applications.get(name)
         is_new = known is None or known.newest < application.newest
         if is_new and newest is not None and newest.given_up:
-            text = f"{name} would return to version {application.wanted}: {newest.given_up}"
-            returns.append(text)
-    return tuple(_actions(state, copy, requested)), returns
+            yield f"{name} would return to version {application.wanted}: {newest.given_up}"
+
+
+def _without_host(state: MasterState, requested: Collection[str]) -> Iterable[str]:
+    """Yield a phrase on each changed process that waits for a host, and not for other processes."""
+    awaiting = state.queue.awaiting
+    for name in requested:
+        application = state.applications.get(name)
+        for task in application.tasks if application is not None else ():
+            process = state.processes.get(task)
+            if process is None or process.phase not in WAITING or task in state.queue.arrays:
+                continue
+            if not any(member in awaiting for member in (task, *state.gangs.of(process))):
+                yield f"{task} would wait: {process.reason}"
 
 
 def copied(state: MasterState) -> MasterState:
@@ -74,6 +105,7 @@ def copied(state: MasterState) -> MasterState:
         shared.append(host.description)
     for application in state.applications.values():
         shared += application.versions.values()
+    shared += state.modes.known.values()
     memo: dict[int, Any] = {id(one): one for one in shared}
     memo[id(state.rankings)], memo[id(state.demands)] = {}, {}
     memo.update((id(one.history), list(one.history)) for one in state.processes.values())

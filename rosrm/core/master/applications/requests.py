@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import rollout
 from rosrm.core.master.applications.difference import Difference, differences
-from rosrm.core.master.applications.planning import plan
+from rosrm.core.master.applications.planning import Outlook, plan
 from rosrm.core.master.assignment.gangs import check_gangs
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
@@ -46,47 +46,59 @@ def applications_requested(
     state: MasterState, event: happened.ApplicationsRequested, now: float
 ) -> None:
     """Make the requested versions the desired ones, or reply with the plan of that."""
-    prepared = _prepared(state, event)
     if event.plan_only:
-        names = {one.application.name for one in prepared}
-        actions, returns = plan(
-            state, lambda copy: _execute(copy, event, prepared, now), names, now
-        )
-        message = "; ".join((_summary(prepared), *returns))
-        state.emit(Reply(event.request, message=message, actions=actions))
+        planned = outlook(state, event.targets, event.by, now)
+        state.emit(Reply(event.request, message=planned.message, actions=planned.actions))
         return
-    _execute(state, event, prepared, now)
-    actions = tuple(_actions(prepared))
-    state.emit(Reply(event.request, message=_summary(prepared), actions=actions))
+    message, actions = execute(state, event.targets, event.by, now)
+    state.emit(Reply(event.request, message=message, actions=actions))
 
 
-def _execute(
-    state: MasterState, event: happened.ApplicationsRequested, prepared: Iterable[Prepared],
-    now: float,
-) -> None:  # fmt: skip
+def execute(
+    state: MasterState, targets: Sequence[Target], by: Requester, now: float
+) -> tuple[str, tuple[PlannedAction, ...]]:
+    """Make versions of applications the desired ones; return a summary and the actions.
+
+    Raises:
+        RequestRefused: one of them cannot be; nothing was changed.
+    """
+    prepared = _prepared(state, targets, by)
+    _want_all(state, prepared, by, now)
+    return _summary(prepared), tuple(_actions(prepared))
+
+
+def outlook(state: MasterState, targets: Sequence[Target], by: Requester, now: float) -> Outlook:
+    """Return the plan of `execute`, which raises the same."""
+    prepared = _prepared(state, targets, by)
+    names = {one.application.name for one in prepared}
+    planned = plan(state, lambda copy: _want_all(copy, prepared, by, now), names, now)
+    return replace(planned, message="; ".join((_summary(prepared), *planned.returns)))
+
+
+def _want_all(state: MasterState, prepared: Iterable[Prepared], by: Requester, now: float) -> None:
     for one in prepared:
-        _want(state, one, event.by, now)
+        _want(state, one, by, now)
 
 
 # --- checks -----------------------------------------------------------------------------------
 
 
-def _prepared(state: MasterState, event: happened.ApplicationsRequested) -> list[Prepared]:
+def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> list[Prepared]:
     """Return the checked targets; refuse the request as a whole."""
-    _refuse_twice((one.application for one in event.targets), "application")
-    versions = [_version_of(state, one, event.by) for one in event.targets]
+    _refuse_twice((one.application for one in targets), "application")
+    versions = [_version_of(state, one, by) for one in targets]
     wanted = [spec for version in versions if version for spec in version.specs.values()]
     _refuse_twice((spec.name for spec in wanted), "process")
     prepared = []
-    for target, version in zip(event.targets, versions, strict=True):
+    for target, version in zip(targets, versions, strict=True):
         specs: Mapping[str, ProcessSpec] = {} if version is None else version.specs
-        _check_names(state, target.application, specs, event.by)
+        _check_names(state, target.application, specs, by)
         own = state.names_of(target.application)
         found = differences(state, target.application, specs, own)
         application = state.applications.get(target.application)
-        known = application or Application(target.application, event.by.name)
+        known = application or Application(target.application, by.name)
         prepared.append(Prepared(known, version, found))
-    _check_specs(state, prepared, event.by)
+    _check_specs(state, prepared, by)
     return prepared
 
 

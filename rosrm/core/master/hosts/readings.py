@@ -77,7 +77,7 @@ def _store(
         used = rows >= 0
         where = np.broadcast_to(at[:, None], rows.shape)[used]
         table.usage[rows[used], where] = usage[used]
-        table.limit[rows[used], where] = limit[used]
+        table.set_own_limit(rows[used], where, limit[used])
     np.add(table.usage, table.load, out=table.busy)
     if stale.any():  # a stale reading excludes the host only if the resource has a limit
         stale = stale & ((limit < 1.0) * _SLOT_BITS).sum(axis=1, dtype=np.uint32)
@@ -92,4 +92,4 @@ def _store_alike(
     for slot, row in enumerate(rows):
         if row >= 0:
             table.usage[row, columns] = usage[:, slot]
-            table.limit[row, columns] = limit[:, slot]
+            table.set_own_limit(row, columns, limit[:, slot])

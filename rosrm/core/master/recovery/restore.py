@@ -14,10 +14,12 @@ from rosrm.core.master.lifecycle import (
     note_phase,
 )
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.modes.settings import apply_settings
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state import applications, migration
 from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
+from rosrm.core.master.state.modes import restored_modes
 from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
 from rosrm.model.codec import fields_from_plain, from_plain
 from rosrm.model.devices import HeldDevice
@@ -61,6 +63,8 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     cluster = intents("cluster")
     numbers = cluster.get("instances", {})
     state.next_instance = state.reserved_instances = int(numbers.get("next", 1))
+    state.modes = restored_modes(cluster.get("modes", {}), intents("mode"))
+    apply_settings(state)
     journal_gap.restore(state, cluster)
     images.restore(state, cluster)
 

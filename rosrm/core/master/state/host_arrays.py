@@ -6,6 +6,7 @@ the values of a few hosts are copied in one step.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -18,8 +19,8 @@ BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.int64]
 
 #: Planes of the block, and their values for a host that has no such resource.
-USAGE, LOAD, LIMIT, CAPACITY, BUSY = range(5)
-_ABSENT: Final = (np.nan, 0.0, 1.0, np.nan, np.nan)
+USAGE, LOAD, LIMIT, CAPACITY, BUSY, OWN_LIMIT = range(6)
+_ABSENT: Final = (np.nan, 0.0, 1.0, np.nan, np.nan, 1.0)
 
 #: Number of processes that means "no bound".
 NO_BOUND: Final = 2**62
@@ -32,7 +33,9 @@ class HostColumns:
         resources: names of the rows.
         usage: (R, H) newest reading, fraction; NaN where a host has no such resource.
         load: (R, H) reservations of instances that the readings do not show yet, fraction.
-        limit: (R, H) fraction; 1 where a host has no such resource.
+        own_limit: (R, H) fraction by the host's settings; 1 where it has no such resource.
+        limit: (R, H) fraction in force: `own_limit`, or the ceiling of the resource, if lower.
+        ceilings: resource to the highest limit that any host may have.
         capacity: (R, H) base units; NaN where a host has no such resource.
         busy: (R, H) usage + load.
         condition: (H,) HostCondition.
@@ -56,6 +59,7 @@ class HostColumns:
 
     def __init__(self) -> None:
         self.resources: tuple[str, ...] = ()
+        self.ceilings: Mapping[str, float] = {}
         self._columns_in_use = 0
         self._allocate(rows=0, columns=4)
         self._trim()
@@ -106,6 +110,21 @@ class HostColumns:
         self._cells = np.concatenate([self._cells, row], axis=1)
         self._trim()
 
+    def set_own_limit(self, rows: IntArray | int, columns: IntArray, limits: FloatArray) -> None:
+        """Set limits by the settings of hosts; the ceilings stay in force."""
+        self.own_limit[rows, columns] = limits
+        self.limit[rows, columns] = limits
+        if self.ceilings:
+            self.apply_ceilings(columns)
+
+    def apply_ceilings(self, columns: IntArray | slice) -> None:
+        """Set the limits of hosts that are in force from their own limits and the ceilings."""
+        for row, name in enumerate(self.resources):
+            own = self.own_limit[row, columns]
+            ceiling = self.ceilings.get(name, 1.0)
+            has_it = ~np.isnan(self.capacity[row, columns])
+            self.limit[row, columns] = np.where(has_it, np.minimum(own, ceiling), own)
+
     def _trim(self) -> None:
         """Set the arrays as views of the columns in use; called only when the shape changes."""
         self.cells: FloatArray = self._cells[:, :, : self._columns_in_use]
@@ -114,6 +133,7 @@ class HostColumns:
         self.limit: FloatArray = self.cells[LIMIT]
         self.capacity: FloatArray = self.cells[CAPACITY]
         self.busy: FloatArray = self.cells[BUSY]
+        self.own_limit: FloatArray = self.cells[OWN_LIMIT]
         used = {name: line[: self._columns_in_use] for name, line in self._lines.items()}
         self.condition: npt.NDArray[np.int8] = used["condition"]
         self.asking: BoolArray = used["asking"]
@@ -135,6 +155,6 @@ class HostColumns:
 
     def clear_column(self, column: int) -> None:
         """Clear a column before its host registers its resources again; reservations stay."""
-        for plane in (USAGE, LIMIT, CAPACITY, BUSY):
+        for plane in (USAGE, LIMIT, CAPACITY, BUSY, OWN_LIMIT):
             self.cells[plane, :, column] = _ABSENT[plane]
         self.row_of_slot[column] = -1

@@ -436,6 +436,14 @@ class HostTable(HostColumns):
         described = host.description.resources
         return [resource.name for slot, resource in enumerate(described) if bits >> slot & 1]
 
+    def set_ceilings(self, ceilings: Mapping[str, float]) -> None:
+        """Set the highest limit that any host may have, by resource."""
+        if ceilings == self.ceilings:
+            return
+        self.ceilings = dict(ceilings)
+        self.apply_ceilings(slice(None))
+        self.changed()
+
     def over_limit(self, column: int) -> list[str]:
         """Return the resources whose reading is at or over the limit of a host."""
         over = _over(self.usage[:, column], self.limit[:, column])

@@ -1,0 +1,74 @@
+"""Values of modes: named sets of applications, of which one is in force."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from rosrm.model.applications import Target
+from rosrm.model.values import EMPTY
+from rosrm.wording import duration
+
+
+@dataclass(frozen=True, slots=True)
+class Trigger:
+    """Condition that puts a mode into force; without a host and a resource there is none.
+
+    Attributes:
+        host_lost: name of a host that is lost.
+        over_limit: resource of which a host is over its limit.
+        lasts: seconds for which it must be.
+    """
+
+    host_lost: str = ""
+    over_limit: str = ""
+    lasts: float = 0.0
+
+    def __str__(self) -> str:
+        if self.host_lost:
+            return f"{self.host_lost} is lost"
+        if self.over_limit:
+            return f"a host is over its limit of {self.over_limit} for {duration(self.lasts)}"
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """A set of applications, with limits and weights that apply while the mode is in force.
+
+    Attributes:
+        targets: the desired applications, with the parameters of the mode.
+        limits: resource to the highest fraction of it that any host may use.
+        weights: resource to its weight in the scoring policies; empty: the weights of the cluster.
+        when: condition that puts the mode into force.
+    """
+
+    name: str
+    targets: tuple[Target, ...]
+    limits: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    weights: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    when: Trigger = Trigger()
+
+    @property
+    def applications(self) -> tuple[str, ...]:
+        """Return the names of its applications."""
+        return tuple(target.application for target in self.targets)
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRow:
+    """One mode, as it is listed.
+
+    Attributes:
+        state: "in force"; "switching": its applications are not as desired yet; "": neither.
+        when: condition that puts it into force; "": none.
+        reason: why it was left, or not reached, when this was tried last; "": it was not.
+    """
+
+    name: str
+    state: str
+    applications: tuple[str, ...]
+    limits: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    weights: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    when: str = ""
+    reason: str = ""

@@ -1,0 +1,272 @@
+"""Modes: one set of applications is in force, and a switch to another is one request."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Reply
+from rosrm.core.master.modes.switching import mode_rows
+from rosrm.extensions.placement import PolicySettings, ScoringLink
+from rosrm.model.applications import RolloutPolicy, Target
+from rosrm.model.modes import Mode, Trigger
+from rosrm.model.values import HostLossPolicy, ProcessSpec
+from tests.unit.core.cluster import Cluster, Eq1, Machine, movable, process
+from tests.unit.core.test_applications import actions, new
+
+
+def target(name: str, *specs: ProcessSpec, **rollout: Any) -> Target:
+    """Return the desired state of an application."""
+    policy = RolloutPolicy(**{"healthy_for": 1.0, **rollout})
+    return Target(name, tuple(replace(one, application=name) for one in specs), rollout=policy)
+
+
+NAV = target("nav", process("planner"), process("driver"))
+MAP = target("map", process("mapper"))
+DOCK = target("dock", process("charger"))
+EXPLORING = Mode("exploring", (NAV, MAP))
+DOCKED = Mode("docked", (NAV, DOCK))
+
+
+def load(cluster: Cluster, *modes: Mode) -> Reply:
+    return cluster.ask(happened.ModesLoaded, modes)
+
+
+def switch(cluster: Cluster, mode: str, seconds: float = 3.0, *, plan: bool = False) -> Reply:
+    """Request a mode, and let time pass."""
+    reply = cluster.ask(happened.ModeRequested, mode, plan)
+    cluster.wait(seconds)
+    return reply
+
+
+def states(cluster: Cluster) -> dict[str, str]:
+    return {row.name: row.state for row in mode_rows(cluster.state)}
+
+
+def running(cluster: Cluster) -> set[str]:
+    """Return the names of all processes that really run."""
+    return {name for name in cluster.state.processes if cluster.where(name)}
+
+
+def in_mode(mode: str, *modes: Mode, cluster: Cluster | None = None) -> Cluster:
+    """Return a cluster with the modes, of which one is in force."""
+    cluster = cluster or Cluster("a", "b")
+    assert load(cluster, *modes).accepted
+    assert switch(cluster, mode).accepted
+    assert states(cluster)[mode] == "in force"
+    return cluster
+
+
+# --- switches ---------------------------------------------------------------------------------
+
+
+def test_a_switch_does_not_touch_what_both_modes_share() -> None:
+    """The rest of the new mode starts, and that of the old one stops."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    kept = [cluster[name].owner for name in ("planner", "driver")]
+    reply = switch(cluster, "docked")
+    assert actions(reply) == {"charger": "start", "mapper": "stop"}
+    assert running(cluster) == {"planner", "driver", "charger"}
+    assert [cluster[name].owner for name in ("planner", "driver")] == kept
+    assert states(cluster) == {"exploring": "", "docked": "in force"}
+    assert cluster.recorded("mode_reached")[-1] == "the mode docked is in force"
+
+
+def test_a_mode_changes_the_parameters_of_an_application() -> None:
+    """The changed process is replaced."""
+    slow = replace(DOCKED, targets=(target("nav", new(movable("planner")), process("driver")),))
+    cluster = in_mode("exploring", EXPLORING, slow)
+    assert actions(switch(cluster, "docked", 9.0)) == {"planner": "replace", "mapper": "stop"}
+    assert states(cluster)["docked"] == "in force"
+    assert cluster.state.applications["nav"].wanted == 2
+
+
+def test_a_plan_of_a_switch_changes_nothing() -> None:
+    """It lists what the switch would do."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    planned = switch(cluster, "docked", plan=True)
+    assert actions(planned) == {"charger": "start", "mapper": "stop"}
+    assert states(cluster) == {"exploring": "in force", "docked": ""}
+    assert actions(switch(cluster, "exploring", plan=True)) == {}
+
+
+@pytest.mark.parametrize("killed_after", range(0, 24, 2))
+def test_a_killed_master_goes_on_with_a_switch(killed_after: int) -> None:
+    """At each moment; every process runs once."""
+    changed = target("nav", new(movable("planner")), process("driver"))
+    docked = replace(DOCKED, targets=(changed, DOCK))
+    exploring = replace(EXPLORING, targets=(target("nav", movable("planner")), MAP))
+    cluster = in_mode("exploring", exploring, docked)
+    switch(cluster, "docked", killed_after * 0.1)
+    cluster.restart_master()
+    cluster.wait(15.0)
+    assert states(cluster) == {"exploring": "", "docked": "in force"}
+    assert running(cluster) == {"planner", "driver", "charger"}
+
+
+# --- modes that cannot be reached -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("charger", "why"),
+    [
+        (process("charger", 20_000), "charger would wait: "),
+        (process("charger", required_labels={"dock": "yes"}), "charger would wait: "),
+    ],
+)
+def test_a_mode_without_a_host_for_a_process_is_refused(charger: ProcessSpec, why: str) -> None:
+    """The old mode stays in force; the plan says the same."""
+    cluster = in_mode("exploring", EXPLORING, Mode("docked", (NAV, target("dock", charger))))
+    before = running(cluster)
+    reply = switch(cluster, "docked")
+    assert not reply.accepted
+    assert reply.message.startswith(f"the mode docked cannot be reached: {why}")
+    assert reply.message.endswith("exploring stays in force")
+    assert (running(cluster), states(cluster)["exploring"]) == (before, "in force")
+    assert why in switch(cluster, "docked", plan=True).message
+
+
+def test_a_mode_whose_process_fails_is_left_again() -> None:
+    """The old mode returns, with its own processes; the record and the list say why."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    kept = cluster["planner"].owner
+    for machine in cluster.machines.values():
+        machine.refuses["charger"] = "no such program"
+    switch(cluster, "docked", 9.0)
+    assert running(cluster) == {"planner", "driver", "mapper"}
+    assert cluster["planner"].owner == kept
+    assert states(cluster)["exploring"] == "in force"
+    (failed,) = cluster.recorded("mode_failed")
+    assert failed.startswith("the mode docked is not reached, and exploring returns: charger is")
+    (row,) = [one for one in mode_rows(cluster.state) if one.name == "docked"]
+    assert row.reason.startswith("charger is")
+
+
+def test_a_new_version_that_fails_ends_the_switch() -> None:
+    """The application returns to its former version, and the cluster to its former mode."""
+    worse = target("nav", new(movable("planner")), process("driver"), healthy_for=3.0)
+    cluster = in_mode("exploring", replace(EXPLORING, targets=(
+        target("nav", movable("planner"), process("driver")), MAP)),
+        replace(DOCKED, targets=(worse, DOCK)))  # fmt: skip
+    switch(cluster, "docked", 2.5)
+    cluster.finish("planner", on=cluster.where("planner")[0], code=1)
+    cluster.wait(15.0)
+    assert states(cluster) == {"exploring": "in force", "docked": ""}
+    assert running(cluster) == {"planner", "driver", "mapper"}
+
+
+def test_an_unknown_mode_is_refused_with_the_nearest_name() -> None:
+    """Nothing is changed."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    reply = switch(cluster, "dokced")
+    assert (reply.accepted, reply.code) == (False, "unknown")
+    assert "'docked'" in reply.message
+
+
+# --- conditions -------------------------------------------------------------------------------
+
+
+def test_the_loss_of_a_host_puts_its_mode_into_force_once() -> None:
+    """An operator may leave it again while the host is away, also over a restart of the master."""
+    degraded = replace(DOCKED, when=Trigger(host_lost="b"))
+    loss = HostLossPolicy("elsewhere")
+    nav = target("nav", process("planner", host_loss=loss), process("driver", host_loss=loss))
+    cluster = in_mode(
+        "exploring", replace(EXPLORING, targets=(nav, MAP)), replace(degraded, targets=(nav, DOCK))
+    )
+    cluster.cut("b", seconds=15.0)
+    assert states(cluster)["docked"] == "in force"
+    assert "the cluster switches to the mode docked: b is lost" in cluster.recorded("mode_begins")
+    assert switch(cluster, "exploring").accepted
+    cluster.restart_master()
+    cluster.wait(15.0)
+    assert states(cluster)["exploring"] == "in force"
+    cluster.rejoin("b")
+    cluster.cut("b", seconds=15.0)
+    assert states(cluster)["docked"] == "in force"
+
+
+def test_a_host_that_stays_over_its_limit_puts_a_mode_into_force() -> None:
+    """After the time of the condition, not before."""
+    degraded = replace(DOCKED, when=Trigger(over_limit="memory", lasts=5.0))
+    cluster = in_mode("exploring", EXPLORING, degraded)
+    cluster.machines["b"].busy["memory"] = 0.95
+    cluster.wait(3.0)
+    assert states(cluster)["exploring"] == "in force"
+    cluster.wait(5.0)
+    assert states(cluster)["docked"] == "in force"
+
+
+def test_a_condition_whose_mode_cannot_be_reached_changes_nothing() -> None:
+    """The record says so, once."""
+    never = target("dock", process("charger", required_labels={"dock": "yes"}))
+    cluster = in_mode("exploring", EXPLORING, Mode("docked", (never,), when=Trigger("b")))
+    cluster.cut("b", seconds=15.0)
+    assert states(cluster) == {"exploring": "in force", "docked": ""}
+    (failed,) = cluster.recorded("mode_failed")
+    assert failed.startswith("b is lost, but the mode docked cannot be reached: charger would wait")
+
+
+# --- limits and weights -----------------------------------------------------------------------
+
+
+def test_the_limits_of_a_mode_apply_while_it_is_in_force() -> None:
+    """No host may exceed them, and none may exceed its own; later readings change nothing."""
+    cluster = Cluster(Machine("a", limits={"memory": 0.7}), Machine("b", limits={"memory": 0.9}))
+    tight = replace(DOCKED, limits={"memory": 0.8})
+
+    def limits() -> list[float]:
+        table = cluster.state.hosts
+        return [float(one) for one in table.limit[table.resources.index("memory")]]
+
+    in_mode("exploring", EXPLORING, tight, cluster=cluster)
+    assert limits() == [0.7, 0.9]
+    switch(cluster, "docked")
+    assert limits() == [0.7, 0.8]
+    cluster.restart_master()
+    assert limits() == [0.7, 0.8]
+    switch(cluster, "exploring")
+    assert limits() == [0.7, 0.9]
+
+
+def test_the_weights_of_a_mode_apply_while_it_is_in_force() -> None:
+    """They replace those of the policies that have weights."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.1, "cpu": 0.6}))
+    made: list[Any] = []
+
+    def chain_of(settings: Any) -> tuple[ScoringLink, ...]:
+        made.append({one.name: one.options for one in settings})
+        return tuple(ScoringLink("eq1", Eq1(**one.options["weights"])) for one in settings)
+
+    cluster.state.chain_of = chain_of
+    cluster.state.scoring = (PolicySettings("eq1", 1.0, {"weights": {"memory": 1.0}}),)
+    in_mode("docked", replace(DOCKED, weights={"memory": 0.0, "cpu": 1.0}), EXPLORING,
+            cluster=cluster)  # fmt: skip
+    assert made[-1] == {"eq1": {"weights": {"memory": 0.0, "cpu": 1.0}}}
+    switch(cluster, "exploring")
+    assert made[-1] == {"eq1": {"weights": {"memory": 1.0}}}
+
+
+# --- loading ----------------------------------------------------------------------------------
+
+
+def test_the_mode_in_force_cannot_be_removed() -> None:
+    """The other modes can be replaced."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    reply = load(cluster, DOCKED)
+    assert not reply.accepted
+    assert "the mode exploring is in force, and the file does not have it" in reply.message
+    assert load(cluster, EXPLORING).message == "1 mode loaded: exploring"
+    assert list(cluster.intents["mode"]) == ["exploring"]
+
+
+def test_modes_survive_a_restart_of_the_master() -> None:
+    """In the order of their file."""
+    cluster = in_mode("exploring", EXPLORING, replace(DOCKED, when=Trigger(over_limit="cpu")))
+    before = mode_rows(cluster.state)
+    cluster.restart_master()
+    assert mode_rows(cluster.state) == before
+    assert cluster.state.modes.known["docked"].targets == DOCKED.targets
