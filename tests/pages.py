@@ -62,6 +62,7 @@ RUN: Final[Mapping[str, Page]] = {
     "docs/tutorials/your-first-application.md": Page(),
     "docs/how-to/limits-and-migration.md": Page(hosts=("robot-1", "robot-2")),
     "docs/how-to/applications.md": Page(hosts=("robot-1", "robot-2")),
+    "docs/how-to/modes.md": Page(hosts=("robot-1", "robot-2")),
     "docs/how-to/stateful-node.md": Page(hosts=("desk", "shelf")),
     "docs/how-to/portable-node.md": Page(
         hosts=("robot",), cluster="migration: {strategies: [criu]}"

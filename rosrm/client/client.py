@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rosrm.client.logs import LogChunk, LogReader, LogSelection
     from rosrm.client.waiting import OnChange, Until, WaitResult
     from rosrm.model.applications import ApplicationRow, ApplyResult
+    from rosrm.model.modes import ModeRow
     from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow
     from rosrm.ros.master_connection import MasterClient
 
@@ -120,8 +121,11 @@ class Client:
 
     def apply_targets(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
         """Make applications as their targets describe them, all or none; see `apply`."""
-        sent = [replace(one, specs=tuple(self._sent(one.specs))) for one in targets]
+        sent = [self._sent_target(one) for one in targets]
         return self._master.apply(sent, plan_only=plan_only)
+
+    def _sent_target(self, target: Target) -> Target:
+        return replace(target, specs=tuple(self._sent(target.specs)))
 
     def revert(self, application: str, version: int, *, plan_only: bool = False) -> ApplyResult:
         """Make an earlier version of an application the desired one again.
@@ -136,6 +140,36 @@ class Client:
     def cancel_application(self, application: str) -> ApplyResult:
         """Cancel all processes of an application; its versions stay."""
         return self._master.apply([Target(application)])
+
+    def load_modes(self, file: Path) -> str:
+        """Replace the modes of the cluster by those of a file; return the master's message.
+
+        Args:
+            file: path of modes.yaml.
+
+        Raises:
+            ConfigError: the file, or a work file that it names, is invalid; nothing was sent.
+        """
+        from rosrm.config.modes import load_modes  # noqa: PLC0415 - imports pydantic
+
+        modes = [
+            replace(mode, targets=tuple(map(self._sent_target, mode.targets)))
+            for mode in load_modes(os.fspath(file))
+        ]
+        return self._master.load_modes(modes)
+
+    def switch_mode(self, mode: str, *, plan_only: bool = False) -> ApplyResult:
+        """Put a mode into force.
+
+        Args:
+            mode: its name.
+            plan_only: True: return the actions that would follow, and begin none.
+        """
+        return self._master.switch_mode(mode, plan_only=plan_only)
+
+    def list_modes(self) -> Sequence[ModeRow]:
+        """Return all modes, in the order of their file."""
+        return self.list(modes=True).modes
 
     def list_applications(self) -> Sequence[ApplicationRow]:
         """Return all applications with their versions."""
@@ -213,8 +247,8 @@ class Client:
     def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, applications: bool = False,
-        events: bool = False, process: str = "", host: str = "", after: int = 0, newest: int = 0,
-        on_wait: Callable[[float], None] | None = None,
+        modes: bool = False, events: bool = False, process: str = "", host: str = "",
+        after: int = 0, newest: int = 0, on_wait: Callable[[float], None] | None = None,
     ) -> Listing:  # fmt: skip
         """Return the requested listings; one request reads all of them.
 
@@ -223,6 +257,7 @@ class Client:
             processes: True: list the processes.
             plugins: True: list all plugins; "failing": only the failing ones.
             applications: True: list the applications.
+            modes: True: list the modes.
             events: True: list events, the oldest first.
             process: limit processes and events to this process; "": all.
             host: limit events to this host; "": all.
@@ -233,7 +268,8 @@ class Client:
         """
         return self._master.list(
             hosts=hosts, processes=processes, plugins=plugins, applications=applications,
-            events=events, process=process, host=host, after=after, newest=newest, on_wait=on_wait,
+            modes=modes, events=events, process=process, host=host, after=after, newest=newest,
+            on_wait=on_wait,
         )  # fmt: skip
 
     def list_processes(self) -> Sequence[ProcessRow]:
@@ -410,6 +446,20 @@ class Client:
             self._master, _list(names), timeout=timeout, on_change=on_change or _ignore,
             notify=self._notify,
         )  # fmt: skip
+
+    def wait_for_mode(
+        self, *, timeout: float | None = None,
+        on_change: Callable[[ApplicationRow], None] | None = None,
+    ) -> Sequence[ModeRow]:  # fmt: skip
+        """Wait until no switch of modes is under way; return the last rows.
+
+        The arguments are those of `wait_for_applications`.
+        """
+        from rosrm.client import waiting  # noqa: PLC0415 - for those who wait
+
+        return waiting.wait_for_mode(
+            self._master, timeout=timeout, on_change=on_change or _ignore, notify=self._notify
+        )
 
     def wait_for_drain(
         self, host: str, *, after: int, timeout: float | None = None

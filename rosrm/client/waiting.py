@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.rows import EventRow, ProcessRow
+from rosrm.model.modes import ModeRow
+from rosrm.model.rows import EventRow, Listing, ProcessRow
 from rosrm.wording import standing
 
 if TYPE_CHECKING:
@@ -134,20 +135,51 @@ def wait_for_applications(
         on_change: takes a row with each change of its pending processes.
         notify: takes a message when the master is silent.
     """
+
+    def is_done(view: Listing) -> bool:
+        rows = [row for row in view.applications if row.name in names]
+        return not any(row.state in ("applying", "returning") for row in rows)
+
+    view = _watch(master, is_done, names, timeout, on_change, notify)
+    return [row for row in view.applications if row.name in names]
+
+
+def wait_for_mode(
+    master: MasterClient, *, timeout: float | None, on_change: Callable[[ApplicationRow], None],
+    notify: Notify,
+) -> Sequence[ModeRow]:  # fmt: skip
+    """Watch the modes until no switch is under way; otherwise as `wait_for_applications`."""
+
+    def is_done(view: Listing) -> bool:
+        return not any(row.state == "switching" for row in view.modes)
+
+    return _watch(master, is_done, None, timeout, on_change, notify).modes
+
+
+def _watch(
+    master: MasterClient, is_done: Callable[[Listing], bool], names: Collection[str] | None,
+    timeout: float | None, on_change: Callable[[ApplicationRow], None], notify: Notify,
+) -> Listing:  # fmt: skip
+    """List applications and modes until something is done, and report changes of the former.
+
+    Args:
+        names: of the applications; None: all.
+    """
     deadline = deadline_after(timeout)
     seen: dict[str, ApplicationRow] = {}
     while True:
         view = ask_until_answered(
-            lambda on_wait: master.list(applications=True, on_wait=on_wait), notify, deadline
-        )
-        rows = [row for row in view.applications if row.name in names]
-        for row in rows:
+            lambda on_wait: master.list(applications=True, modes=True, on_wait=on_wait),
+            notify, deadline,
+        )  # fmt: skip
+        for row in view.applications:
+            if names is not None and row.name not in names:
+                continue
             if row.pending and seen.get(row.name) != row:
                 on_change(row)
             seen[row.name] = row
-        awaited = [row for row in rows if row.state in ("applying", "returning")]
-        if not awaited or time.monotonic() >= deadline:
-            return rows
+        if is_done(view) or time.monotonic() >= deadline:
+            return view
         time.sleep(PERIOD)
 
 

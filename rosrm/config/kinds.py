@@ -23,23 +23,27 @@ _KEYS: Final = {
     "cluster": {f.name for f in fields(ClusterConfig)},
     "host": {f.name for f in fields(HostConfig)},
     "work": {"processes", "defaults"},
+    "modes": {"modes"},
     "simulation": {*SIMULATION_KEYS},
 }
 #: A file without this key is of another kind.
-_NEEDED: Final = {"work": "processes", "simulation": "hosts"}
+_NEEDED: Final = {"work": "processes", "simulation": "hosts", "modes": "modes"}
 #: End of a file's name, before `.yaml`.
-_NAMES: Final = {"cluster": "cluster", "host": "host", "work": "work", "sim": "simulation"}
+_NAMES: Final = {
+    "cluster": "cluster", "host": "host", "work": "work", "modes": "modes", "sim": "simulation",
+}  # fmt: skip
 #: Command that uses a file of each kind.
 _COMMANDS: Final = {
     "cluster": "rosrm master --config",
     "host": "rosrm slave --config",
     "work": "rosrm submit",
+    "modes": "rosrm mode --load",
     "simulation": "rosrm simulate",
 }
 
 
 def kind_of(root: Node) -> str:
-    """Return the kind of file: "cluster", "host", "work" or "simulation".
+    """Return the kind of file: "cluster", "host", "work", "modes" or "simulation".
 
     Raises:
         ConfigError: its keys fit no kind, or several equally, and its name fits no kind.
@@ -57,7 +61,7 @@ def kind_of(root: Node) -> str:
     if best:
         fault = f"its keys fit a {' and a '.join(best)} file alike"
     else:
-        fault = "it has no key of a cluster, host, work or simulation file"
+        fault = "it has no key of a cluster, host, work, modes or simulation file"
         known = [key for keys in _KEYS.values() for key in keys]
         for key in root.items:
             if close := get_close_matches(key, known, 1):

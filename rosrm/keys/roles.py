@@ -104,6 +104,8 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "explain": _READERS,
     "submit": _SUBMITTERS,
     "apply": _SUBMITTERS,
+    "load_modes": _OPERATORS,
+    "switch_mode": _OPERATORS,
     "cancel": _SUBMITTERS,
     "restart": _SUBMITTERS,
     "migrate": _SUBMITTERS,

@@ -10,6 +10,7 @@ from typing import Any, Final
 from rosrm.core.master import listing
 from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.modes.switching import mode_rows
 from rosrm.core.master.state.hosts import Host
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.master.disclosure import disclosed
@@ -67,6 +68,7 @@ class MasterQueries:
             plugins=self._plugin_rows(request) if request.plugins else (),
             events=self._events(request, by) if request.events else (),
             applications=self._applications(by) if request.applications else (),
+            modes=mode_rows(state) if request.modes else (),
         )
 
     def _processes(self, name: str, now: float, by: Requester) -> list[ProcessRow]:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.devices import Device
+from rosrm.model.modes import ModeRow
 from rosrm.model.values import EMPTY, HostDescription
 
 #: Kinds of offers; "plugin": a plugin that failed before its offers were known.
@@ -179,6 +180,7 @@ class Listing:
     plugins: Sequence[PluginRow] = ()
     events: Sequence[EventRow] = ()
     applications: Sequence[ApplicationRow] = ()
+    modes: Sequence[ModeRow] = ()
     trouble: str = ""
     security: str = "keys"
     strangers: str = ""

@@ -33,7 +33,9 @@ _OTHER_LETTERS: Final = {
     "ControlHost_Response.result": 1 << 20,
     "Explain_Response.explanation": 1 << 24,
     "Apply_Response.actions": 1 << 24,
+    "SwitchMode_Response.actions": 1 << 24,
     "List_Response.application_list": 1 << 24,
+    "List_Response.mode_list": 1 << 24,
 }
 _OTHER_ENTRIES: Final = {
     "Assignment.state_key": 32,
@@ -71,6 +73,10 @@ _OTHER_ENTRIES: Final = {
     "Sealed.body": 1 << 24,
     "Submit_Request.processes": 10_000,
     "Apply_Request.targets": 1000,
+    "LoadModes_Request.modes": 256,
+    "Mode.targets": 1000,
+    "Mode.limits": 64,
+    "Mode.weights": 64,
     "ApplicationTarget.processes": 10_000,
     "List_Response.process_list": 1 << 20,
     "List_Response.plugin_list": 1 << 20,

@@ -34,6 +34,7 @@ from rosrm.model.devices import (
 from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import limits_fault
+from rosrm.model.modes import Mode, Trigger
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
@@ -167,10 +168,7 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
     return _to_msg(
         msg.ProcessSpec, spec,
         parameters=[msg.KeyValue(key=key, value=json.dumps(value)) for key, value in parameters],
-        needs=[
-            msg.ResourceAmount(resource=name, amount=float(amount))
-            for name, amount in spec.needs.items()
-        ],
+        needs=_amounts_to_msg(spec.needs),
         migration=_to_msg(
             msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
         ),
@@ -230,6 +228,51 @@ def target_from_msg(
         raise Refused(fault)
     rollout = RolloutPolicy(message.max_parallel, message.healthy_for, message.on_failure)
     return Target(message.application, specs, message.version, rollout)
+
+
+def mode_to_msg(mode: Mode) -> msg.Mode:
+    """Return a mode as a message."""
+    return msg.Mode(
+        name=mode.name, targets=[target_to_msg(one) for one in mode.targets],
+        limits=_amounts_to_msg(mode.limits), weights=_amounts_to_msg(mode.weights),
+        host_lost=mode.when.host_lost, over_limit=mode.when.over_limit,
+        lasts=float(mode.when.lasts),
+    )  # fmt: skip
+
+
+def mode_from_msg(message: msg.Mode, targets: tuple[Target, ...]) -> Mode:
+    """Return the inverse of `mode_to_msg`; raises `Refused` for an invalid mode.
+
+    `targets`: its applications.
+    """
+    fault = name_fault(message.name, "mode") or _mode_fault(message)
+    if fault:
+        raise Refused(fault)
+    return Mode(
+        message.name, targets,
+        {one.resource: one.amount for one in message.limits},
+        {one.resource: one.amount for one in message.weights},
+        Trigger(message.host_lost, message.over_limit, message.lasts),
+    )  # fmt: skip
+
+
+def _mode_fault(message: msg.Mode) -> str:
+    mode = f"mode {message.name}"
+    for what, amounts in (("limits", message.limits), ("weights", message.weights)):
+        for one in amounts:
+            if not 0.0 <= one.amount <= 1.0:
+                return f"{mode}: {what}.{one.resource!r:.60} is {one.amount}; allowed: 0 to 1"
+    if message.host_lost and message.over_limit:
+        return f"{mode}: when: give a lost host or a limit, not both"
+    if not 0.0 <= message.lasts <= LONGEST:
+        return f"{mode}: when: lasts is {message.lasts}; allowed: 0 to {LONGEST:g} s"
+    return ""
+
+
+def _amounts_to_msg(amounts: Mapping[str, float]) -> list[msg.ResourceAmount]:
+    return [
+        msg.ResourceAmount(resource=name, amount=float(amount)) for name, amount in amounts.items()
+    ]
 
 
 def _rollout_fault(message: msg.ApplicationTarget) -> str:

@@ -17,6 +17,7 @@ from rosrm.keys.roles import SecurityMode
 from rosrm.keys.security import Member
 from rosrm.model.applications import ApplicationRow, ApplyResult, PlannedAction, Target
 from rosrm.model.codec import from_plain
+from rosrm.model.modes import Mode, ModeRow
 from rosrm.model.orders import CHECK_TIMEOUT
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
@@ -95,6 +96,11 @@ class _Answers:
     def answer(self) -> Any:
         """The first answer; None: there is none."""
         return self.first[0] if self.first else None
+
+
+def _apply_result(answer: Any) -> ApplyResult:
+    actions = from_plain(tuple[PlannedAction, ...], json.loads(answer.actions))
+    return ApplyResult(str(answer.answer.message), actions)
 
 
 def is_unsure(answer: Any, epoch: int) -> bool:
@@ -277,8 +283,18 @@ class MasterClient:
             srv.Apply, names.APPLY, targets=[convert.target_to_msg(one) for one in targets],
             plan_only=plan_only,
         )  # fmt: skip
-        actions = from_plain(tuple[PlannedAction, ...], json.loads(answer.actions))
-        return ApplyResult(str(answer.answer.message), actions)
+        return _apply_result(answer)
+
+    def load_modes(self, modes: Sequence[Mode]) -> str:
+        """Replace the modes of the cluster, all or none; return the master's message."""
+        return self._ask(
+            srv.LoadModes, names.LOAD_MODES, modes=[convert.mode_to_msg(one) for one in modes]
+        )
+
+    def switch_mode(self, mode: str, *, plan_only: bool = False) -> ApplyResult:
+        """Switch to a mode, or return the plan of that."""
+        answer = self._request(srv.SwitchMode, names.SWITCH_MODE, mode=mode, plan_only=plan_only)
+        return _apply_result(answer)
 
     def store_artifact(self, digest: str, size: int, offset: int, data: bytes = b"") -> int:
         """Send a part of an artifact, and return the offset of the part that the master expects.
@@ -343,8 +359,8 @@ class MasterClient:
     def list(  # noqa: PLR0913 - the parts of one listing
         self, *, hosts: bool = False, processes: bool = False,
         plugins: bool | Literal["failing"] = False, applications: bool = False,
-        events: bool = False, process: str = "", host: str = "", after: int = 0, newest: int = 0,
-        on_wait: OnWait | None = None,
+        modes: bool = False, events: bool = False, process: str = "", host: str = "",
+        after: int = 0, newest: int = 0, on_wait: OnWait | None = None,
     ) -> Listing:  # fmt: skip
         """Return the requested listings; `plugins="failing"` limits plugins to failing ones.
 
@@ -354,8 +370,8 @@ class MasterClient:
         request = srv.List.Request(
             protocol_version=PROTOCOL_VERSION, hosts=hosts, processes=processes,
             plugins=bool(plugins), failing=plugins == "failing", events=events,
-            applications=applications, process=process, host=host, after_sequence=after,
-            max_events=newest,
+            applications=applications, modes=modes, process=process, host=host,
+            after_sequence=after, max_events=newest,
         )  # fmt: skip
         answer = self._call(srv.List, names.LIST, request, on_wait=on_wait)
         return Listing(
@@ -367,6 +383,7 @@ class MasterClient:
             applications=from_plain(
                 tuple[ApplicationRow, ...], json.loads(answer.application_list)
             ),
+            modes=from_plain(tuple[ModeRow, ...], json.loads(answer.mode_list)),
             events=[convert.event_from_msg(row) for row in answer.event_list],
         )  # fmt: skip
 

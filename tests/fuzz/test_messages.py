@@ -85,6 +85,8 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "order": (srv.ControlHost.Request, order_from_msg),
     "submit": (srv.Submit.Request, lambda one: MASTER._submitted(one, 1, SENDER)),
     "apply": (srv.Apply.Request, lambda one: MASTER._applied(one, 1, SENDER)),
+    "modes": (srv.LoadModes.Request, lambda one: MASTER._modes_loaded(one, 1, SENDER)),
+    "mode": (srv.SwitchMode.Request, lambda one: services._mode_requested(one, 1, SENDER)),
     "cancel": (srv.Cancel.Request, lambda one: services._cancelled(one, 1, SENDER)),
     "migrate": (srv.Migrate.Request, lambda one: services._migrated(one, 1, SENDER)),
     "host state": (srv.SetHostState.Request, lambda one: services._host_set(one, 1, SENDER)),

@@ -26,6 +26,7 @@ from rosrm.cli.commands import (
     follow,
     inspect,
     key,
+    modes,
     plugin,
     run,
     runtimes,
@@ -124,7 +125,7 @@ def common(
     ctx.obj = CommonOptions(domain, cluster)
 
 
-for module in (up, runtimes, applications, change, inspect, follow):
+for module in (up, runtimes, applications, modes, change, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
 app.command(cls=PlainCommand, context_settings={"allow_interspersed_args": False})(run.run)

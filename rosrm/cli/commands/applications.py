@@ -30,7 +30,7 @@ Plan = Annotated[
 NoWait = Annotated[bool, typer.Option("--no-wait", help="End once the master has accepted it.")]
 
 #: Exit code of a plan with actions, as of `diff` in other tools.
-_DIFFERS: Final = 2
+DIFFERS: Final = 2
 
 
 def apply(  # noqa: PLR0917 - an argument for each option
@@ -117,7 +117,7 @@ def _carry_out(
             if plan and result.actions:
                 tables.show(applications.actions(result.actions))
         if plan:
-            raise typer.Exit(_DIFFERS if result.actions else 0)
+            raise typer.Exit(DIFFERS if result.actions else 0)
         if no_wait:
             return
         with interruptible("the applications change further (`rosrm apps`)"):

@@ -35,6 +35,7 @@ class KindOfFile(str, Enum):
     CLUSTER = "cluster"
     HOST = "host"
     WORK = "work"
+    MODES = "modes"
     SIMULATION = "simulation"
 
 
@@ -48,7 +49,8 @@ def check(
     files: Annotated[
         list[Path],
         typer.Argument(
-            metavar="FILE...", help="cluster.yaml, host.yaml, work.yaml or a simulation's workload."
+            metavar="FILE...",
+            help="cluster.yaml, host.yaml, work.yaml, modes.yaml or a simulation's workload.",
         ),
     ],
     kind: Annotated[
@@ -125,6 +127,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     from rosrm.config.documents import read
     from rosrm.config.host import checked_host
     from rosrm.config.kinds import kind_of
+    from rosrm.config.modes import checked_modes
     from rosrm.config.work import checked_work
     from rosrm.core.master.graph_names import node_of, shared_nodes
 
@@ -144,6 +147,9 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             _make_probes(file, host, registry)
             probes = ", ".join(registry.default_probes() if host.probes is None else host.probes)
             return f"a host: {host.host}, probes {probes or 'none'}"
+        case "modes":
+            modes = checked_modes(root, file, registry)
+            return f"{counted(len(modes), 'mode')}: {listed(mode.name for mode in modes)}"
         case "simulation":
             return _check_of_simulations(file)(file, registry)
         case _:

@@ -15,6 +15,7 @@ from rosrm.errors import JournalError, Refused
 from rosrm.keys.roles import Principal, Role
 from rosrm.keys.security import Authority, Peer
 from rosrm.keys.tickets import TICKET_LIFE, Ticket
+from rosrm.model.applications import Target
 from rosrm.model.codec import to_plain
 from rosrm.model.requester import Requester
 from rosrm.model.rows import Listing
@@ -124,6 +125,8 @@ class MasterServices:
             (srv.Leave, names.LEAVE, self._left),
             (srv.Submit, names.SUBMIT, self._submitted),
             (srv.Apply, names.APPLY, self._applied),
+            (srv.LoadModes, names.LOAD_MODES, self._modes_loaded),
+            (srv.SwitchMode, names.SWITCH_MODE, _mode_requested),
             (srv.Cancel, names.CANCEL, _cancelled),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
@@ -178,7 +181,7 @@ class MasterServices:
         response = kind.Response(answer=answer)
         if kind is srv.Migrate:
             response.host = reply.host
-        elif kind is srv.Apply:
+        elif kind in (srv.Apply, srv.SwitchMode):
             response.actions = json.dumps(to_plain(reply.actions))
         return response
 
@@ -187,11 +190,20 @@ class MasterServices:
         return happened.SubmissionReceived(token, specs, _requester(peer))
 
     def _applied(self, request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:
-        targets = tuple(
-            convert.target_from_msg(one, self._specs(one.processes)) for one in request.targets
-        )
+        targets = self._targets(request.targets)
         by = _requester(peer)
         return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
+
+    def _modes_loaded(
+        self, request: srv.LoadModes.Request, token: int, peer: Peer
+    ) -> happened.Event:
+        modes = tuple(
+            convert.mode_from_msg(one, self._targets(one.targets)) for one in request.modes
+        )
+        return happened.ModesLoaded(token, modes, _requester(peer))
+
+    def _targets(self, messages: Iterable[Any]) -> tuple[Target, ...]:
+        return tuple(convert.target_from_msg(one, self._specs(one.processes)) for one in messages)
 
     def _specs(self, messages: Iterable[Any]) -> tuple[ProcessSpec, ...]:
         """Return the specs of a request, whose artifacts are stored; raises `Refused`."""
@@ -375,6 +387,7 @@ class MasterServices:
                 process_list=[convert.process_row_to_msg(row) for row in view.processes],
                 plugin_list=[convert.plugin_row_to_msg(row) for row in view.plugins],
                 application_list=json.dumps(to_plain(tuple(view.applications))),
+                mode_list=json.dumps(to_plain(tuple(view.modes))),
                 event_list=[convert.event_to_msg(row) for row in view.events],
             )
         )  # fmt: skip
@@ -399,6 +412,10 @@ def _check_name(slave: Peer, name: str) -> None:
             f"{own} may not register as {name!r}: a slave registers only the host of its key",
             "denied",
         )
+
+
+def _mode_requested(request: srv.SwitchMode.Request, token: int, peer: Peer) -> happened.Event:
+    return happened.ModeRequested(token, request.mode, bool(request.plan_only), _requester(peer))
 
 
 def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:

@@ -78,7 +78,7 @@ def test_the_standard_input_is_checked(rosrm, monkeypatch, text, said):
     ("text", "said"),
     [
         ("ros: {domain: 1}", "its keys fit a cluster and a host file alike; choose one with --kin"),
-        ("", "it has no key of a cluster, host, work or simulation file; choose"),
+        ("", "it has no key of a cluster, host, work, modes or simulation file; choose"),
         ("proceses: []", "simulation file, and 'proceses': did you mean 'processes'? Choose one"),
         ("- {name: a}", "it is no mapping; in a work file the list is under `processes:`"),
     ],

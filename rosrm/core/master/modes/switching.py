@@ -41,10 +41,11 @@ from rosrm.wording import counted, few, listed, no_such
 
 def modes_loaded(state: MasterState, event: happened.ModesLoaded, now: float) -> None:
     """Replace all modes, or refuse them; the applications stay as they are."""
-    former = state.modes
+    former, known = state.modes, {mode.name: mode for mode in event.modes}
+    if len(known) < len(event.modes):
+        raise RequestRefused("the name of a mode is given twice. Nothing was changed")
     for mode in event.modes:
         _check_weights(state, mode)
-    known = {mode.name: mode for mode in event.modes}
     if former.wanted and former.wanted not in known:
         raise RequestRefused(
             f"the mode {former.wanted} is in force, and the file does not have it: keep it there, "

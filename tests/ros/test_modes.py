@@ -1,0 +1,100 @@
+"""Modes on a real cluster: what both share runs on, and a lost host switches by itself."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+import yaml
+
+from rosrm.config.settings import LivenessSettings
+from rosrm.errors import Refused
+from rosrm.model.modes import ModeRow
+from tests.ros.clusters import Cluster, host
+from tests.waiting import PATIENCE
+
+STOP = {"interrupt_grace": 0.5, "terminate_grace": 0.5}
+
+
+def work(directory: Path, app: str, *names: str, **fields: object) -> str:
+    """Write the work file of an application, and return its name."""
+    parts = [{"name": name, "command": ["sleep", "1000"], "stop": STOP, **fields} for name in names]
+    content = {"app": app, "rollout": {"healthy_for": 0.2}, "processes": parts}
+    (directory / f"{app}.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
+    return f"{app}.yaml"
+
+
+def load(cluster: Cluster, modes: dict[str, dict[str, object]]) -> str:
+    path = cluster.directory / "modes.yaml"
+    path.write_text(yaml.safe_dump({"modes": modes}), encoding="utf-8")
+    return cluster.client.load_modes(path)
+
+
+def reach(cluster: Cluster) -> dict[str, ModeRow]:
+    """Wait until no switch is under way; return the modes by name."""
+    rows = cluster.client.wait_for_mode(timeout=PATIENCE)
+    return {row.name: row for row in rows}
+
+
+def test_a_switch_keeps_the_pids_of_what_both_modes_share(make_cluster) -> None:
+    """Also where the master is killed in the middle, and past a mode that cannot be reached."""
+    cluster = make_cluster(host("a"))
+    nav = work(cluster.directory, "navigation", "planner", "driver")
+    mapping = work(cluster.directory, "mapping", "mapper")
+    dock = work(cluster.directory, "docking", "charger")
+    never = work(cluster.directory, "never", "huge", needs={"memory": "1TB"})
+    loaded = load(
+        cluster,
+        {
+            "exploring": {"applications": [nav, mapping]},
+            "docked": {"applications": [nav, dock], "limits": {"memory": 0.5}},
+            "never": {"applications": [never]},
+        },
+    )
+    assert loaded == "3 modes loaded: exploring, docked and never"
+    cluster.client.switch_mode("exploring")
+    assert reach(cluster)["exploring"].state == "in force"
+    pids = {name: cluster.wait(name, "running").pid for name in ("planner", "driver")}
+
+    with pytest.raises(Refused, match="the mode never cannot be reached: huge would wait: "):
+        cluster.client.switch_mode("never")
+    planned = cluster.client.switch_mode("docked", plan_only=True)
+    assert {one.process: one.action.value for one in planned.actions} == {
+        "charger": "start", "mapper": "stop",
+    }  # fmt: skip
+
+    cluster.client.switch_mode("docked")
+    cluster.restart_master()
+    assert reach(cluster)["docked"].state == "in force"
+    assert cluster.wait("charger", "running").pid
+    assert cluster.wait("mapper", "cancelled")
+    assert {name: cluster.process(name).pid for name in pids} == pids
+    limits = {one.name: one.limit for one in cluster.client.get_host("a").resources}
+    assert limits["memory"] == 0.5
+
+
+def test_a_lost_host_puts_a_mode_into_force(make_cluster) -> None:
+    """The operator has done nothing but load the modes."""
+    cluster = make_cluster(
+        host("a", labels={"site": "a"}),
+        host("b"),
+        liveness=LivenessSettings(suspect=1.0, lease=2.0),
+    )
+    nav = work(cluster.directory, "navigation", "planner", labels={"site": "a"})
+    both = work(cluster.directory, "watching", "watcher", labels={"site": "a"})
+    load(
+        cluster,
+        {
+            "usual": {"applications": [nav]},
+            "degraded": {"applications": [nav, both], "when": {"host_lost": "b"}},
+        },
+    )
+    cluster.client.switch_mode("usual")
+    assert reach(cluster)["usual"].state == "in force"
+    pid = cluster.wait("planner", "running").pid
+    cluster.end(cluster.slaves["b"], signal.SIGKILL)
+    cluster.wait_for_event("mode_begins", "switches to the mode degraded: b is lost")
+    assert reach(cluster)["degraded"].state == "in force"
+    assert cluster.wait("watcher", "running").host == "a"
+    assert cluster.process("planner").pid == pid
