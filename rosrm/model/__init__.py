@@ -2,6 +2,7 @@
 
 values.py               processes, hosts, instances, resources
 applications.py         applications: targets, planned actions, rows
+modes.py                modes: sets of applications of which one is in force
 artifacts.py            files and directories that processes get on their hosts
 devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 def mode(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     name: Annotated[
-        str, typer.Argument(metavar="[MODE]", help="Mode to switch to; default: list the modes.")
+        str, typer.Argument(metavar="MODE", help="Mode to switch to; default: list the modes.")
     ] = "",
     load: Annotated[
         Path | None,

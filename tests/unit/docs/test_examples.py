@@ -42,7 +42,7 @@ def blocks(page: Path, language: str) -> Iterator[tuple[str, str, str]]:
 
 
 FILES = [
-    pytest.param(title, text, id=f"{name_of(page)}:{title}:{number}")
+    pytest.param(page, title, text, id=f"{name_of(page)}:{title}:{number}")
     for page in PAGES
     for number, (_, title, text) in enumerate(blocks(page, "yaml"))
     if title
@@ -54,17 +54,19 @@ def registry() -> Registry:
     return Registry.discover()
 
 
-@pytest.mark.parametrize(("title", "text"), FILES)
-def test_every_file_that_is_shown_is_right(title, text, tmp_path, monkeypatch, registry):
+@pytest.mark.parametrize(("page", "title", "text"), FILES)
+def test_every_file_that_is_shown_is_right(page, title, text, tmp_path, monkeypatch, registry):
     """`rosrm config check FILE` accepts it, and finds its kind from keys or name.
 
-    The artifacts that it names exist.
+    The artifacts that it names exist, and so do the other files of its page.
     """
-    for process in yaml.safe_load(text).get("processes", ()):
-        for path in process.get("artifacts", {}).values():
-            (tmp_path / path).mkdir(parents=True)
+    shown = {other: content for _, other, content in blocks(page, "yaml") if other}
+    for name, content in {**shown, title: text}.items():
+        (tmp_path / name).write_text(content, encoding="utf-8")
+        for process in yaml.safe_load(content).get("processes", ()):
+            for path in process.get("artifacts", {}).values():
+                (tmp_path / path).mkdir(parents=True, exist_ok=True)
     file = tmp_path / title
-    file.write_text(text, encoding="utf-8")
     monkeypatch.setattr(Registry, "discover", lambda: registry)
     done = CliRunner().invoke(app, ["config", "check", str(file)])
     assert done.exit_code == 0, done.exception
