@@ -75,8 +75,6 @@ _OTHER_ENTRIES: Final = {
     "Apply_Request.targets": 1000,
     "LoadModes_Request.modes": 256,
     "Mode.targets": 1000,
-    "Mode.limits": 64,
-    "Mode.weights": 64,
     "ApplicationTarget.processes": 10_000,
     "List_Response.process_list": 1 << 20,
     "List_Response.plugin_list": 1 << 20,

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from rosrm.client.waiting import wait_for_mode
+from rosrm.config.modes import load_modes
 from rosrm.config.settings import LivenessSettings
 from rosrm.errors import Refused
 from rosrm.model.modes import ModeRow
@@ -27,13 +29,15 @@ def work(directory: Path, app: str, *names: str, **fields: object) -> str:
 
 def load(cluster: Cluster, modes: dict[str, dict[str, object]]) -> str:
     path = cluster.directory / "modes.yaml"
-    path.write_text(yaml.safe_dump({"modes": modes}), encoding="utf-8")
-    return cluster.client.load_modes(path)
+    path.write_text(yaml.safe_dump({"modes": modes}, sort_keys=False), encoding="utf-8")
+    return cluster.client.load_modes(load_modes(path))
 
 
 def reach(cluster: Cluster) -> dict[str, ModeRow]:
     """Wait until no switch is under way; return the modes by name."""
-    rows = cluster.client.wait_for_mode(timeout=PATIENCE)
+    rows = wait_for_mode(
+        cluster.client, timeout=PATIENCE, on_change=lambda _: None, notify=lambda _: None
+    )
     return {row.name: row for row in rows}
 
 
@@ -70,8 +74,8 @@ def test_a_switch_keeps_the_pids_of_what_both_modes_share(make_cluster) -> None:
     assert cluster.wait("charger", "running").pid
     assert cluster.wait("mapper", "cancelled")
     assert {name: cluster.process(name).pid for name in pids} == pids
-    limits = {one.name: one.limit for one in cluster.client.get_host("a").resources}
-    assert limits["memory"] == 0.5
+    (row,) = cluster.client.list(hosts=True).hosts
+    assert {one.name: one.limit for one in row.resources}["memory"] == 0.5
 
 
 def test_a_lost_host_puts_a_mode_into_force(make_cluster) -> None:
@@ -81,8 +85,8 @@ def test_a_lost_host_puts_a_mode_into_force(make_cluster) -> None:
         host("b"),
         liveness=LivenessSettings(suspect=1.0, lease=2.0),
     )
-    nav = work(cluster.directory, "navigation", "planner", labels={"site": "a"})
-    both = work(cluster.directory, "watching", "watcher", labels={"site": "a"})
+    nav = work(cluster.directory, "navigation", "planner", labels={"required": {"site": "a"}})
+    both = work(cluster.directory, "watching", "watcher", labels={"required": {"site": "a"}})
     load(
         cluster,
         {

@@ -134,7 +134,7 @@ class FakeClient:
         self._note("explain", name)
         return STORY
 
-    def list(self, *, hosts=False, processes=False, plugins=False, applications=False,
+    def list(self, *, hosts=False, processes=False, plugins=False, applications=False, modes=False,
              events=False, process="", host="", after=0, newest=0, on_wait=None):  # fmt: skip
         if on_wait is not None:
             for seconds in self.waits:

@@ -101,7 +101,10 @@ def test_a_killed_master_goes_on_with_a_switch(killed_after: int) -> None:
     exploring = replace(EXPLORING, targets=(target("nav", movable("planner")), MAP))
     cluster = in_mode("exploring", exploring, docked)
     switch(cluster, "docked", killed_after * 0.1)
-    cluster.restart_master()
+    cluster.kill_master()
+    cluster.wait(0.5)  # a moment without any host
+    for machine in cluster.machines.values():
+        cluster.register(machine)
     cluster.wait(15.0)
     assert states(cluster) == {"exploring": "", "docked": "in force"}
     assert running(cluster) == {"planner", "driver", "charger"}
@@ -140,9 +143,9 @@ def test_a_mode_whose_process_fails_is_left_again() -> None:
     assert cluster["planner"].owner == kept
     assert states(cluster)["exploring"] == "in force"
     (failed,) = cluster.recorded("mode_failed")
-    assert failed.startswith("the mode docked is not reached, and exploring returns: charger is")
+    assert failed.startswith("the mode docked is not reached, and exploring returns: charger ")
     (row,) = [one for one in mode_rows(cluster.state) if one.name == "docked"]
-    assert row.reason.startswith("charger is")
+    assert row.reason.startswith("charger ")
 
 
 def test_a_new_version_that_fails_ends_the_switch() -> None:

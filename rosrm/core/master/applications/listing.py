@@ -19,7 +19,7 @@ def application_rows(state: MasterState) -> list[ApplicationRow]:
 
 def _row(state: MasterState, application: Application) -> ApplicationRow:
     unwell = {
-        name: why for name in application.specs if (why := why_unwell(state, application, name))
+        name: why for name in application.specs if (why := _why_unwell(state, application, name))
     }
     pending = {name: task.fault or task.reason for name, task in application.tasks.items()}
     condition = _condition(application, unwell)
@@ -42,7 +42,7 @@ def _condition(application: Application, unwell: dict[str, str]) -> ApplicationS
     return "degraded" if unwell else "running"
 
 
-def why_unwell(state: MasterState, application: Application, name: str) -> str:
+def _why_unwell(state: MasterState, application: Application, name: str) -> str:
     """Return a predicate for a process of an application that is not as desired; "" if it is."""
     process = state.processes.get(name)
     if process is None or process.spec.application != application.name:

@@ -21,7 +21,6 @@ from math import inf
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import requests as applications
-from rosrm.core.master.applications.listing import why_unwell
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.modes.settings import apply_settings, weighted
@@ -185,11 +184,11 @@ def _faults(state: MasterState, mode: Mode) -> Iterator[str]:
             known = state.processes.get(process)
             if known is not None and known.phase is ProcessPhase.SET_ASIDE:
                 yield f"{process} is set aside: {known.reason or task.reason}"
-        if not application.tasks:
-            for process in application.specs:
-                why = why_unwell(state, application, process)
-                if why:
-                    yield f"{process} {why}"
+        # A process out of reach is no fault: its host may return, as after a restart of the master.
+        for process in application.specs if not application.tasks else ():
+            known = state.processes.get(process)
+            if known is not None and known.phase is ProcessPhase.FAILED:
+                yield f"{process} has failed: {known.reason}"
 
 
 def _handle_fault(state: MasterState, mode: Mode, fault: str, now: float) -> None:
