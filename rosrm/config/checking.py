@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import types
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from typing import (
@@ -23,7 +23,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
 from rosrm.config.documents import Node, Place, Problems
 from rosrm.extensions.units import UnfitAmount
-from rosrm.wording import get_close_matches
+from rosrm.wording import get_close_matches, listed
 
 T = TypeVar("T")
 
@@ -178,12 +178,34 @@ def _note(
     if error["type"] in _UNKNOWN_KEY:
         inside = _named(path[:-1], where)
         note = f"unknown key {path[-1]!r}" + (f" in {inside}" if inside else "")
-        allowed = _keys(wanted, path[:-1])
-        note += _meant(_closest_key(str(path[-1]), allowed), allowed)
-        problems.add(target.key_place or target.place, note)
+        problems.add(target.key_place or target.place, note + _instead(wanted, path))
         return
     prefix = _named(path, where)
-    problems.add(target.place, (f"{prefix}: " if prefix else "") + _message_of(error))
+    example = _example(wanted, path, where) if error["type"] in _WANTED else ""
+    problems.add(target.place, (f"{prefix}: " if prefix else "") + _message_of(error) + example)
+
+
+def _instead(wanted: Any, path: tuple[str | int, ...]) -> str:
+    """Return the text after an unknown key: where the key belongs, or the allowed keys."""
+    given = str(path[-1])
+    if any(given in getattr(owner, "SECTIONS", ()) for owner in _types_at(wanted, path[:-1])):
+        return f"; `{given}` is a section of the file, beside `processes`"
+    allowed = _keys(wanted, path[:-1])
+    return _meant(_closest_key(given, allowed), allowed)
+
+
+def _example(wanted: Any, path: tuple[str | int, ...], where: str) -> str:
+    """Return examples of the innermost key of a path that has some; "": none has."""
+    places = [(path[: end - 1], path[end - 1]) for end in range(len(path), 0, -1)]
+    found = ((key, _examples(owner, key)) for at, key in places for owner in _types_at(wanted, at))
+    key, forms = next((one for one in found if one[1]), (where, _examples(wanted, "")))
+    return f", such as {listed((f'`{key}: {form}`' for form in forms), 'or')}" if forms else ""
+
+
+def _examples(owner: Any, key: str | int) -> Sequence[str]:
+    """Return examples of a key of a dataclass; "": of the dataclass itself."""
+    examples: Mapping[str | int, Sequence[str]] = getattr(owner, "EXAMPLES", {})
+    return examples.get(key, ())
 
 
 def _named(path: tuple[str | int, ...], where: str) -> str:

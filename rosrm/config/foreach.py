@@ -5,7 +5,7 @@
 
 In every text of the entry `{i}` is replaced by the value, and `{i:02d}` by the value in Python's
 format. A text that consists of `{i}` alone becomes the value itself, number or text. `{{` is a
-plain brace. `{device.camera}` stays for the host that runs the process.
+plain brace. `{device.camera}` and `{artifacts}` stay for the host that runs the process.
 
 `array: 1-100` expands an entry in the same way, with `{array.index}` as its value, also beside
 `foreach`.
@@ -23,7 +23,7 @@ from rosrm.config.arrays import as_member, checked_indexes
 from rosrm.config.checking import described, near
 from rosrm.config.documents import Node, Problems
 from rosrm.model.arrays import INDEX
-from rosrm.model.devices import PLACEHOLDER
+from rosrm.model.placeholders import PLACEHOLDER
 
 #: Highest number of processes to which one entry may expand.
 MOST: Final = 10_000

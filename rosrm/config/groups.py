@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import ClassVar, Final
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Node, Problems
-from rosrm.config.process import ListOfWords, Text
+from rosrm.config.process import ListOfWords, Name
 from rosrm.config.rules import check_name
 from rosrm.model.values import GroupEnd, GroupMembership, ProcessSpec
 from rosrm.wording import few, get_close_matches
@@ -21,7 +21,11 @@ _ANY: Final = "any"
 class GroupInFile:
     """Group of all processes of a file, and the processes whose end ends the others."""
 
-    name: Text = ""
+    EXAMPLES: ClassVar[Mapping[str, Sequence[str]]] = {
+        "": ("{name: tests, ends_with: any}",), "ends_with": ("[camera]",), "fails_with": ("any",),
+    }  # fmt: skip
+
+    name: Name = ""
     ends_with: ListOfWords = ()
     fails_with: ListOfWords = ()
 

@@ -109,7 +109,13 @@ class ProcessSection:
 
 @dataclass(frozen=True)
 class PlainWord:
-    """Annotation of text that needs no quotes, even if YAML reads it as a number or boolean."""
+    """Annotation of text that needs no quotes, even if YAML reads it as a number or boolean.
+
+    Attributes:
+        boolean: False: a boolean is refused, because it is probably no name but a wrong form.
+    """
+
+    boolean: bool = True
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that converts a scalar into text."""
@@ -117,11 +123,10 @@ class PlainWord:
 
         return core_schema.no_info_before_validator_function(self.text, handler(source))
 
-    @staticmethod
-    def text(given: Any) -> Any:
+    def text(self, given: Any) -> Any:
         """Return a scalar as text; any other value unchanged."""
         if isinstance(given, bool):
-            return "true" if given else "false"
+            return json.dumps(given) if self.boolean else given
         return str(given) if isinstance(given, (int, float)) else given
 
 

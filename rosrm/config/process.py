@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
@@ -55,6 +55,7 @@ _READINESS: Final = Readiness()
 _STOP: Final = StopPolicy()
 
 Text = Annotated[str, PlainWord()]
+Name = Annotated[str, PlainWord(boolean=False)]
 Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
 _Value = TypeVar("_Value")
 ListOfWords = Annotated[tuple[Text, ...], Words()]
@@ -127,7 +128,7 @@ class StandbyInFile:
     """Second instance on another host that follows the state."""
 
     wanted: bool = True
-    apart_by: tuple[Text, ...] = ()
+    apart_by: tuple[Name, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +154,8 @@ class LabelsInFile:
 class NeighboursInFile:
     """Processes near which a process runs, or apart from which."""
 
-    processes: tuple[Text, ...]
-    by: Text = ""
+    processes: tuple[Name, ...]
+    by: Name = ""
     prefer: bool = False
 
 
@@ -162,8 +163,8 @@ class NeighboursInFile:
 class SpreadInFile:
     """Group whose processes run apart from each other; the default is the process itself."""
 
-    by: Text = ""
-    group: Text = ""
+    by: Name = ""
+    group: Name = ""
     prefer: bool = False
 
 
@@ -196,8 +197,8 @@ class SecretInFile:
 class ContainerInFile:
     """Container in which a process runs."""
 
-    image: Text
-    engine: Text = DEFAULT_ENGINE
+    image: Name
+    engine: Name = DEFAULT_ENGINE
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +206,44 @@ class ProcessInFile:
     """One process, with the keys of ROS 2 launch; shorthands are in long form.
 
     Attributes:
+        SECTIONS: keys of the file beside this entry.
+        EXAMPLES: valid values of each key that is no plain text, number or boolean, for messages.
         array: name and index, after the expansion of the array.
     """
+
+    SECTIONS: ClassVar[tuple[str, ...]] = ("app", "rollout", "processes", "defaults", "group")
+    EXAMPLES: ClassVar[Mapping[str, Sequence[str]]] = {
+        "arguments": ("[--rate, 10]",),
+        "parameters": ("{width: 320}",),
+        "remappings": ("{image: front/image}",),
+        "environment": ("{RATE: 10}",),
+        "restart": ("always", "{when: on-failure, attempts: 3}"),
+        "needs": ("{memory: 200MB, cpu: 0.5}",),
+        "labels": ("{required: {camera: front}}",),
+        "migration": ("handoff",),
+        "readiness": ("running", "{timeout: 10s}"),
+        "stop": ("{interrupt_grace: 5s}",),
+        "host_loss": ("elsewhere", "{then: elsewhere, delay: 10s}"),
+        "isolation": ("stop", "{then: stop, after: 10s}"),
+        "standby": ("true", "{apart_by: [rack]}"),
+        "health": ("{topic: scan, rate: 10}", "{lifecycle: active}"),
+        "near": ("camera", "{processes: [camera], by: rack}"),
+        "apart": ("camera", "{processes: [camera], by: rack}"),
+        "spread": ("rack", "{}"),
+        "talks_to": ("{camera: 30MB/s}",),
+        "reschedule": ("{attempts: 2}",),
+        "limits": ("{memory: 500MB, cpu: 1.5}",),
+        "cpus": ("[2, 3]",),
+        "realtime": ("{policy: fifo, priority: 50}",),
+        "devices": ("{gpu: 1, camera: front}",),
+        "at": ('"06:00"',),
+        "on": ("[mon, fri]",),
+        "after": ("camera", "{camera: finished}"),
+        "together": ("swarm",),
+        "secrets": ("{TOKEN: {file: /etc/token}}",),
+        "container": ("ubuntu:24.04",),
+        "artifacts": ("{model.onnx: ./model.onnx}",),
+    }
 
     name: str
     namespace: str = ""
@@ -253,7 +290,7 @@ class ProcessInFile:
     at: tuple[str, ...] = ()
     on: tuple[str, ...] = ()
     after: Annotated[StartOrder, StartOrderInFile()] = field(default_factory=StartOrder)
-    together: Text = ""
+    together: Name = ""
     secrets: Annotated[Mapping[str, SecretInFile], NullIsEmpty()] = field(
         default_factory=lambda: EMPTY
     )

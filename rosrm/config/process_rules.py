@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from rosrm.model.arrays import INDEX_PLACEHOLDER
-from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER, artifacts_fault
+from rosrm.model.artifacts import artifacts_fault
 from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import is_namespace, name_fault, other_process_fault
-from rosrm.model.devices import need_fault, unknown_placeholders
+from rosrm.model.devices import need_fault
 from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import limits_fault
+from rosrm.model.placeholders import ARTIFACTS, DEVICE, WITH_PLACEHOLDERS, placeholder_faults
 from rosrm.model.secret_rules import is_variable, secret_faults
 from rosrm.model.values import Kind, ProcessSpec, StartOrder
 from rosrm.wording import listed
@@ -91,6 +92,12 @@ def about_retries(spec: ProcessSpec, keys: AbstractSet[str]) -> Iterator[Complai
         yield Complaint(("retries",), text)
 
 
+def about_empty(keys: AbstractSet[str]) -> Iterator[Complaint]:
+    """Yield a complaint on each empty mapping that would ask for nothing without saying so."""
+    for key in keys & _EMPTY.keys():
+        yield Complaint((key,), f"{key}: {{}} {_EMPTY[key]}")
+
+
 def _about_faults(spec: ProcessSpec) -> Iterator[Complaint]:
     standby = spec.standby
     if standby.wanted and spec.kind == "job":
@@ -131,14 +138,6 @@ def _about_devices(spec: ProcessSpec) -> Iterator[Complaint]:
         fault = need_fault((need,))
         if fault:
             yield Complaint(("devices", need.kind), f"devices: {fault}")
-    kinds = [need.kind for need in spec.devices]
-    for key in ("arguments", "parameters"):
-        for kind in unknown_placeholders(repr(getattr(spec, key)), kinds):
-            yield Complaint(
-                (key,),
-                f"{key}: {{device.{kind}}} needs a device of the kind {kind!r}, which the process "
-                f"does not ask for; its `devices:` are {listed(kinds)}",
-            )
 
 
 def _about_artifacts(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -148,10 +147,14 @@ def _about_artifacts(spec: ProcessSpec) -> Iterator[Complaint]:
     for one in spec.artifacts:
         if not one.source:
             yield Complaint(("artifacts", one.name), f"artifacts.{one.name}: a path is required")
-    for key in _WITH_PLACEHOLDER if not spec.artifacts else ():
-        if ARTIFACTS_PLACEHOLDER in repr(getattr(spec, key)):
-            text = f"{key}: {ARTIFACTS_PLACEHOLDER} needs `artifacts:` in the process"
-            yield Complaint((key,), text)
+
+
+def _about_placeholders(spec: ProcessSpec) -> Iterator[Complaint]:
+    known = [f"{DEVICE}{need.kind}" for need in spec.devices]
+    known += [ARTIFACTS] if spec.artifacts else []
+    for key in WITH_PLACEHOLDERS:
+        for fault in placeholder_faults(repr(getattr(spec, key)), known):
+            yield Complaint((key,), f"{key}: {fault}")
 
 
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -269,12 +272,17 @@ def _fault_of_parameter(value: Any) -> str:
     return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 
+#: Sections that ask for nothing if they are empty, and what they lack.
+_EMPTY: Final = {
+    "health": "has no condition, such as `health: {topic: scan, rate: 10}`",
+    "reschedule": "allows no other host, such as `reschedule: {attempts: 2}`",
+    "spread": (
+        "spreads the processes of one entry with `foreach` or `array`, and this is a single "
+        "process. Give the processes of several entries one group: `spread: {group: maps}`"
+    ),
+}  # fmt: skip
 _Rule = Callable[[ProcessSpec], Iterator[Complaint]]
 _PROGRAM: Final = ("package", "executable", "module", "command")
-#: Fields in which `{artifacts}` stands for the directory of the artifacts.
-_WITH_PLACEHOLDER: Final = (
-    "command", "arguments", "parameters", "environment", "working_directory",
-)  # fmt: skip
 #: Each rule with the keys that it reads.
 _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
@@ -289,8 +297,9 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_health, ("health", "ros", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_start_order, ("name", "after")),
-    (_about_devices, ("devices", "arguments", "parameters")),
-    (_about_artifacts, ("artifacts", *_WITH_PLACEHOLDER)),
+    (_about_devices, ("devices",)),
+    (_about_artifacts, ("artifacts",)),
+    (_about_placeholders, ("devices", "artifacts", *WITH_PLACEHOLDERS)),
     (_about_flows, ("name", "talks_to")),
     (_about_gang, ("together",)),
     (_about_limits, ("limits", "cpus", "realtime", "needs")),

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import ClassVar, Final
 
 from rosrm.extensions.units import PositiveCount, Seconds
 from rosrm.model.applications import OnFailure, RolloutPolicy
@@ -14,6 +15,8 @@ _DEFAULT: Final = RolloutPolicy()
 @dataclass(frozen=True, slots=True)
 class RolloutInFile:
     """Keys of the section; see `RolloutPolicy`."""
+
+    EXAMPLES: ClassVar[Mapping[str, Sequence[str]]] = {"": ("{healthy_for: 3s}",)}
 
     max_parallel: PositiveCount = _DEFAULT.max_parallel
     healthy_for: Seconds = _DEFAULT.healthy_for

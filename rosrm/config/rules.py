@@ -8,8 +8,8 @@ from pathlib import Path
 
 from rosrm.config.documents import Node, Place, Problems
 from rosrm.extensions.units import ANY_AMOUNT, amount_of
-from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER
 from rosrm.model.description_checks import name_fault
+from rosrm.model.placeholders import ARTIFACTS
 
 
 def check_name(node: Node | None, what: str, problems: Problems) -> None:
@@ -74,6 +74,6 @@ def settled_on_host(path: str, file: str | Path) -> str:
     A relative path is joined to the file's directory. `~` stays for the slave, because the home of
     its user may differ there, and so does `{artifacts}`.
     """
-    if path.startswith(("~", ARTIFACTS_PLACEHOLDER)):
+    if path.startswith(("~", f"{{{ARTIFACTS}}}")):
         return path
     return os.path.normpath(Path(file).absolute().parent / path)

@@ -16,7 +16,7 @@ from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
 from rosrm.config.options import PluginCheck
 from rosrm.config.process import ProcessInFile
-from rosrm.config.process_rules import about_retries, complaints
+from rosrm.config.process_rules import about_empty, about_retries, complaints
 from rosrm.config.rollout import RolloutInFile
 from rosrm.config.rules import (
     check_amounts,
@@ -28,11 +28,12 @@ from rosrm.config.rules import (
 from rosrm.core.master.process_defaults import IDENTITY
 from rosrm.extensions.registry import Registry
 from rosrm.model.applications import RolloutPolicy, Target
-from rosrm.model.dependencies import circle_fault, circle_in
+from rosrm.model.contradictions import contradiction_in
+from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
-_SECTIONS: Final = ("app", "rollout", "processes", "defaults", "group")
+_SECTIONS: Final = ProcessInFile.SECTIONS
 #: Keys that are allowed in an entry but not in `defaults`.
 _NOT_IN_DEFAULTS: Final = ("name", "foreach", "array", "parallel")
 #: Keys that are allowed in an entry but not in `defaults.process` of cluster.yaml.
@@ -101,7 +102,7 @@ def checked_work(
         for node in expanded(_with_group(merged(defaults, written_out(entry))), problems)
     ]
     specs = [_process(node, path, plugins, problems) for node in nodes]
-    _refuse_circle(nodes, specs, problems)
+    _refuse_contradictions(nodes, specs, problems)
     refuse_namesakes(nodes, "process", problems)
     members = grouped([spec for spec in specs if spec is not None], root, problems)
     if check_artifacts:
@@ -196,7 +197,8 @@ def _with_group(entry: Node) -> Node:
     name, spread = entry.get("name"), entry.get("spread")
     if name is None or not isinstance(name.value, str) or spread is None:
         return entry
-    if not {"foreach", "array"} & entry.items.keys() or not spread.items or "group" in spread.items:
+    is_mapping = isinstance(spread.value, Mapping)
+    if not {"foreach", "array"} & entry.items.keys() or not is_mapping or "group" in spread.items:
         return entry
     kept = name.value.replace("{", "{{").replace("}", "}}")
     members = {**spread.items, "group": Node(kept, spread.place)}
@@ -215,7 +217,10 @@ def _process(
         return None
     spec = process.spec()
     spec = replace(spec, given=tuple(_given(node, spec)))
-    for complaint in (*complaints(spec, wrong), *about_retries(spec, node.items.keys() - wrong)):
+    given = {key: item for key, item in node.items.items() if key not in wrong}
+    empty = {key for key, item in given.items() if item.value == {}}
+    others = (*about_retries(spec, given.keys()), *about_empty(empty))
+    for complaint in (*complaints(spec, wrong), *others):
         problems.add(node.deepest(complaint.path).place, complaint.text)
     spec = _on_host(spec, path)
     if options is not None:
@@ -229,17 +234,25 @@ def _process(
     return spec
 
 
-def _refuse_circle(
+def _refuse_contradictions(
     nodes: Sequence[Node], specs: Sequence[ProcessSpec | None], problems: Problems
 ) -> None:
-    """Note a circle of processes that start after each other, at the first of them."""
-    known = {spec.name: node for node, spec in zip(nodes, specs, strict=True) if spec is not None}
-    after = {spec.name: list(spec.start_order.after) for spec in specs if spec is not None}
+    """Note processes of the file that can never start, or never run where their rules say."""
     if problems:
         return  # a process that names itself is noted already
-    circle = circle_in(after)
+    known = {spec.name: spec for spec in specs if spec is not None}
+    places = {spec.name: node for node, spec in zip(nodes, specs, strict=True) if spec is not None}
+    for spec in known.values():
+        for name, condition in spec.start_order.after.items():
+            fault = condition_fault(known[name], condition) if name in known else ""
+            if fault:
+                problems.add(places[spec.name].deepest(("after", name)).place, f"after: {fault}")
+    circle = circle_in({name: list(spec.start_order.after) for name, spec in known.items()})
     if circle:
-        problems.add(known[circle[0]].deepest(("after", circle[1])).place, circle_fault(circle))
+        problems.add(places[circle[0]].deepest(("after", circle[1])).place, circle_fault(circle))
+    fault = contradiction_in(known) if any(spec.neighbours for spec in known.values()) else ""
+    if fault:
+        problems.add(places[fault.partition(" ")[0].rstrip(":")].place, fault)
 
 
 def _check_sources(

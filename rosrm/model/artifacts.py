@@ -13,8 +13,6 @@ MOST_ARTIFACTS: Final = 256
 LARGEST_ARTIFACT: Final = 10**13
 #: Variable with the directory of the artifacts of a process.
 ARTIFACTS_VARIABLE: Final = "ROSRM_ARTIFACTS"
-#: The same in an argument, a parameter, an environment variable or the working directory.
-ARTIFACTS_PLACEHOLDER: Final = "{artifacts}"
 #: Rate in bytes a second that a move of a process expects of the network at least.
 _SLOWEST_RATE: Final = 1e6
 

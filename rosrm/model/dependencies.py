@@ -1,9 +1,11 @@
-"""Circles of processes that start after each other."""
+"""Rules on processes that start after each other."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
+
+from rosrm.model.values import Kind, ProcessSpec, StartCondition
 
 
 def circle_in(after: Mapping[str, Iterable[str]]) -> Sequence[str]:
@@ -20,6 +22,14 @@ def circle_in(after: Mapping[str, Iterable[str]]) -> Sequence[str]:
     except CycleError as error:
         return tuple(reversed(error.args[1]))
     return ()
+
+
+def condition_fault(dependency: ProcessSpec, condition: StartCondition) -> str:
+    """Return why no process can await this condition of a dependency; "": it can."""
+    if condition != "finished" or dependency.kind is Kind.JOB:
+        return ""
+    name = dependency.name
+    return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
 
 
 def circle_fault(circle: Sequence[str]) -> str:

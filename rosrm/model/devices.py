@@ -154,8 +154,6 @@ _ALLOWED_UNIT: Final = _ALLOWED.replace("a letter", "a letter, digit or '_'")
 
 #: Beginning of the variables with the devices of a process: `ROSRM_DEVICE_CAMERA`.
 DEVICE_VARIABLE: Final = "ROSRM_DEVICE_"
-#: A device in an argument or parameter: `{device.camera}`.
-PLACEHOLDER: Final = re.compile(r"\{device\.([^{}]*)\}")
 
 
 def device_values(held: Iterable[HeldDevice], devices: Iterable[Device]) -> dict[str, str]:
@@ -170,17 +168,6 @@ def device_values(held: Iterable[HeldDevice], devices: Iterable[Device]) -> dict
         value = paths.get((one.kind, one.unit)) or one.unit
         found[one.kind] = f"{found[one.kind]},{value}" if one.kind in found else value
     return found
-
-
-def unknown_placeholders(text: str, kinds: Iterable[str]) -> list[str]:
-    """Return the kinds that a text names by placeholders, and that are not among `kinds`."""
-    known = set(kinds)
-    return [kind for kind in PLACEHOLDER.findall(text) if kind not in known]
-
-
-def filled(text: str, values: Mapping[str, str]) -> str:
-    """Return a text with the placeholders of the devices in `values` replaced."""
-    return PLACEHOLDER.sub(lambda found: values.get(found[1], found[0]), text)
 
 
 def device_environment(held: Iterable[HeldDevice], values: Mapping[str, str]) -> dict[str, str]:

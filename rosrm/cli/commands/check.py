@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from enum import Enum
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rosrm.config.documents import Node
     from rosrm.config.settings import ClusterConfig, HostConfig
     from rosrm.extensions.registry import Registry
+    from rosrm.model.values import ProcessSpec
 
 #: Lowest similarity of a misspelt word; `gpu_memory` and `memory` are less similar.
 _NEAR: Final = 0.8
@@ -155,13 +156,32 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
         case _:
             for warning in _misspelt_needs(root, registry):  # also for a wrong file
                 echo(warning, err=True)
-            specs = checked_work(root, file, registry).specs
-            for warning in shared_nodes((spec.name, node_of(spec)) for spec in specs):
+            target = checked_work(root, file, registry)
+            specs = target.specs
+            shared = shared_nodes((spec.name, node_of(spec)) for spec in specs)
+            for warning in (*shared, *_unknown_dependencies(specs)):
                 echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
             numbers = ((jobs, "job"), (len(specs) - jobs, "service"))
             parts = [counted(number, noun) for number, noun in numbers if number]
-            return f"work: {listed(parts) if parts else 'no processes'}"
+            title = f"the application {target.application}" if target.application else "work"
+            return f"{title}: {listed(parts) if parts else 'no processes'}"
+
+
+def _unknown_dependencies(specs: Sequence[ProcessSpec]) -> Iterator[str]:
+    """Yield warnings about processes in `after` that are not in the file.
+
+    These are only warnings, because the master may know them.
+    """
+    known = {spec.name for spec in specs}
+    for spec in specs:
+        for name in spec.start_order.after.keys() - known:
+            near = get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else "."
+            yield (
+                f"{spec.name}: after: no process {name!r} in this file{hint} The master refuses "
+                f"the file, unless it has such a process"
+            )
 
 
 def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:

@@ -27,7 +27,7 @@ from rosrm.core.master.events import OrderOutcome
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.pending_orders import DependencyRestart
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
-from rosrm.model.dependencies import circle_fault, circle_in
+from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
 from rosrm.model.description_checks import other_process_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RestartInstance
@@ -220,8 +220,9 @@ def _dependency_fault(
     if process is None and name not in starting:
         return no_such("process", [name], [*starting, *reversed(state.processes)])
     spec = starting[name] if process is None or name in starting else process.spec
-    if condition == "finished" and spec.kind is not Kind.JOB:
-        return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
+    fault = condition_fault(spec, condition)
+    if fault:
+        return fault
     if name in starting or process is None or _holds_since(state, name, condition) < inf:
         return ""
     ends = process.wanted is DesiredState.CANCEL or process.phase.is_terminal

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from rosrm.artifacts.cache import set_directory
-from rosrm.model.artifacts import ARTIFACTS_PLACEHOLDER
+from rosrm.model.placeholders import ARTIFACTS
 from rosrm.model.values import Assignment
+from rosrm.slave.launch.placeholders import filled
 
 
 def with_artifacts(assignment: Assignment, root: Path | None) -> Assignment:
@@ -20,19 +19,4 @@ def with_artifacts(assignment: Assignment, root: Path | None) -> Assignment:
     spec = assignment.spec
     if not spec.artifacts or root is None:
         return assignment
-    directory = str(set_directory(root, spec.artifacts))
-    changed = {
-        name: _filled(getattr(spec, name), directory)
-        for name in ("command", "arguments", "parameters", "environment", "working_directory")
-    }
-    return replace(assignment, spec=replace(spec, **changed))
-
-
-def _filled(value: Any, directory: str) -> Any:
-    if isinstance(value, str):
-        return value.replace(ARTIFACTS_PLACEHOLDER, directory)
-    if isinstance(value, (list, tuple)):
-        return type(value)(_filled(one, directory) for one in value)
-    if isinstance(value, dict):
-        return {key: _filled(one, directory) for key, one in value.items()}
-    return value
+    return filled(assignment, {ARTIFACTS: str(set_directory(root, spec.artifacts))})

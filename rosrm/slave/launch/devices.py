@@ -1,14 +1,12 @@
-"""Devices of an assignment, in its arguments and parameters."""
+"""Devices of an assignment, in the texts of its spec."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import Any
-
 from rosrm.errors import LaunchError
-from rosrm.model.devices import Device, device_values, filled, title_of
+from rosrm.model.devices import Device, device_values, title_of
+from rosrm.model.placeholders import DEVICE
 from rosrm.model.values import Assignment
+from rosrm.slave.launch.placeholders import filled
 
 
 def with_devices(assignment: Assignment, devices: tuple[Device, ...]) -> Assignment:
@@ -29,14 +27,4 @@ def with_devices(assignment: Assignment, devices: tuple[Device, ...]) -> Assignm
     lacking = [need.kind for need in spec.devices if need.kind not in values]
     if lacking:
         raise LaunchError(f"{assignment.instance}: it was assigned without a {lacking[0]}")
-    if not values:
-        return assignment
-    arguments = tuple(filled(argument, values) for argument in spec.arguments)
-    parameters = {name: _filled(value, values) for name, value in spec.parameters.items()}
-    return replace(assignment, spec=replace(spec, arguments=arguments, parameters=parameters))
-
-
-def _filled(value: Any, values: Mapping[str, str]) -> Any:
-    if isinstance(value, str):
-        return filled(value, values)
-    return [_filled(one, values) for one in value] if isinstance(value, list) else value
+    return filled(assignment, {f"{DEVICE}{kind}": value for kind, value in values.items()})

@@ -50,6 +50,7 @@ def check(rosrm, file):
          "ok, a cluster: scoring weighted, migration relaunch, checkpoint none\n"),
         ("host: h1\nros: {domain: 1}", "ok, a host: h1, probes cpu\n"),
         ("processes: [{name: a, command: x, kind: job}]", "ok, work: 1 job\n"),
+        ("app: nav\nprocesses: [{name: a, command: x}]", "ok, the application nav: 1 service\n"),
         ("defaults: {kind: job}\nprocesses: [{name: a, command: x}]", "ok, work: 1 job\n"),
     ],
 )  # fmt: skip
@@ -239,3 +240,14 @@ def test_probes_that_cannot_be_made_are_found_and_absent_ones_are_none_of_them(c
 
 def test_a_resource_that_no_probe_here_measures_is_no_mistake(check):
     assert check("processes: [{name: a, command: x, needs: {gpu_memory: 1}}]").err == ""
+
+
+def test_a_dependency_that_is_not_in_the_file_is_a_warning(check):
+    """The master may know the process; a misspelt name is found before the submission."""
+    result = check(
+        "processes: [{name: camera, command: x}, {name: a, command: x, after: [camra, camera]}]"
+    )
+    assert result.code == 0
+    assert "warning: a: after: no process 'camra' in this file; did you mean 'camera'?" in (
+        result.err
+    )

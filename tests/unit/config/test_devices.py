@@ -102,15 +102,45 @@ def test_a_placeholder_of_a_device_that_the_process_does_not_ask_for_is_refused(
     assert "its `devices:` are camera" in refusal(load_work, text)
 
 
-def test_foreach_leaves_the_placeholders_of_devices_to_the_host(file):
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("{device.gpus}", "its `devices:` are gpu; did you mean {device.gpu}?"),
+        ("{devices.gpu}", "{devices.gpu} is unknown; did you mean {device.gpu}? Allowed: {artif"),
+        ("{artifact}", "{artifact} is unknown; did you mean {artifacts}?"),
+        ("{artefacts}/x", "{artefacts} is unknown; did you mean {artifacts}?"),
+        ("{artifacts}", "{artifacts} needs `artifacts:` in the process"),
+    ],
+)
+@pytest.mark.parametrize("key", ["command", "arguments", "environment"])
+def test_a_misspelt_placeholder_is_refused(refusal, key, word, said):
+    """Otherwise the placeholder would reach the program as text."""
+    value = f'{{X: "{word}"}}' if key == "environment" else f'[x, "{word}"]'
+    keys = {"command": "x", key: value}
+    entry = ", ".join(f"{name}: {item}" for name, item in keys.items())
+    text = f"processes: [{{name: a, {entry}, devices: {{gpu: 1}}}}]"
+    assert f"{key}: {word[:8]}" in refusal(load_work, text)
+    assert said in refusal(load_work, text)
+
+
+def test_other_braces_are_no_placeholders(file):
+    """Shells, awk and formats of Python use braces, too."""
+    words = ["{print $1}", "${HOME}", "{device}", "{x.y}", '{"artifact": 1}', "{}"]
+    (spec,) = load_work(file(f"processes: [{{name: a, command: {['x', *words]!r}}}]"))
+    assert spec.command == ("x", *words)
+
+
+def test_foreach_leaves_placeholders_to_the_host(file):
     """Values of `foreach` are filled in around them."""
     text = """
         processes:
           - name: "a{i}"
             foreach: {i: [1]}
             command: x
-            arguments: ["{i}:{device.camera}"]
+            arguments: ["{i}:{device.camera}", "{artifacts}/{i}"]
             devices: {camera: "top{i}"}
+            artifacts: {x: x}
         """
-    (spec,) = load_work(file(text))
-    assert (spec.arguments, spec.devices[0].units) == (("1:{device.camera}",), ("top1",))
+    (spec,) = load_work(file(text), check_artifacts=False)
+    assert spec.arguments == ("1:{device.camera}", "{artifacts}/1")
+    assert spec.devices[0].units == ("top1",)

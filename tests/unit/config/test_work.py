@@ -182,7 +182,7 @@ def test_the_processes_of_one_entry_are_one_group(file):
         ("talks_to: {b: .inf}", "talks_to.b: "),
         ("talks_to: {b: -1MB/s}", "talks_to.b: '-1MB/s' is not within 0..1e+15"),
         ("talks_to: {b: 30MB}", "talks_to.b: unknown unit 'MB'; did you mean 'MB/s'?"),
-        ("talks_to: [b]", "talks_to: a mapping is required, not a list"),
+        ("talks_to: [b]", "talks_to: a mapping is required, not a list, such as `talks_to: {"),
         ("after: a", "after: a names itself; only other processes are allowed"),
         ("after: [../b]", "after: '../b' cannot be the name of a process"),
         (
@@ -198,7 +198,7 @@ def test_the_processes_of_one_entry_are_one_group(file):
             "after.on_restart: \"restarts\" is unknown; did you mean 'restart'?",
         ),
         ("after: {delay: 2s}", "after: the name of at least one process is required"),
-        ("after: 5", "after: a mapping is required, not 5"),
+        ("after: 5", "after: a mapping is required, not 5, such as `after: camera` or `after: {"),
         ("secrets: {T: {file: t}}", "secrets.T: 't' is no absolute path. A host reads the file"),
         ("secrets: {T: {file: ~/t}}", "secrets.T: '~/t' is no absolute path"),
         ("secrets: {T: {file: /t}}, environment: {T: x}", "secrets.T: `environment` sets T, too"),
@@ -210,6 +210,12 @@ def test_the_processes_of_one_entry_are_one_group(file):
         ("secrets: {T: {fiel: /t}}", "unknown key 'fiel' in secrets.T; did you mean 'file'?"),
         ("secrets: {T: /t}", 'secrets.T: a mapping is required, not "/t"'),
         ("near: [[b]]", "near[0].processes[0]: text is required, not a list"),
+        ("spread: true", "spread.by: text is required, not true, such as `spread: rack` or"),
+        ("spread: {}", "spread: {} spreads the processes of one entry with `foreach`"),
+        ("near: true", "near[0].processes[0]: text is required, not true, such as `near: camera`"),
+        ("together: true", "together: text is required, not true, such as `together: swarm`"),
+        ("health: {}", "health: {} has no condition, such as `health: {topic: scan, rate: 10}`"),
+        ("reschedule: {}", "reschedule: {} allows no other host, such as `reschedule: {attempts"),
         ("spread: {groups: g}", "unknown key 'groups' in spread; did you mean 'group'?"),
         ("near: {processes: [b], prefer: 1}", "near[0].prefer: true or false is required, not 1"),
     ],
@@ -226,6 +232,55 @@ def test_faults_of_neighbours_flows_and_secrets_are_named(file, entry, text):
     assert text in str(error.value)
 
 
+#: Keys that the examples of others need.
+BESIDE = {
+    "spread": "foreach: {i: [1, 2]}", "at": "kind: job", "on": "kind: job, at: '06:00'",
+    "standby": "migration: handoff", "health": "ros: true", "parameters": "ros: true",
+    "remappings": "ros: true",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("key", ProcessInFile.EXAMPLES)
+def test_the_examples_in_messages_are_valid(file, key):
+    """A user copies them."""
+    for form in ProcessInFile.EXAMPLES[key]:
+        name = "a{i}" if key == "spread" else "a"
+        entry = f"name: {name!r}, command: x, {key}: {form}, {BESIDE.get(key, '')}"
+        assert load_work(file(f"processes: [{{{entry}}}]"), check_artifacts=False)
+
+
+def test_the_sections_of_the_file_are_no_keys_of_a_process(refusal):
+    """The message says where they belong, and lists no keys."""
+    said = refusal(load_work, "processes: [{name: a, command: x, group: {name: g}}]")
+    assert said.endswith(
+        "unknown key 'group'; `group` is a section of the file, beside `processes`"
+    )
+
+
+def test_an_empty_spread_of_an_entry_for_many_means_different_hosts(file):
+    """It is the shortest form of a group without a label."""
+    text = 'processes: [{name: "a{i}", foreach: {i: [1, 2]}, command: x, spread: {}}]'
+    rules = [spec.neighbours for spec in load_work(file(text))]
+    assert rules == [(NeighbourRule("apart", group="a{i}"),)] * 2
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "text"),
+    [
+        ("", "after: {a: finished}", ":4:38: after: a is a service, which does not finish; use"),
+        ("near: b, apart: b", "", ":3:5: a and b must run apart, and near each other: no hosts"),
+        (
+            "near: b, labels: {required: {arm: left}}", "labels: {required: {arm: right}}",
+            "a and b must run near each other, but a requires arm=left, and b arm=right",
+        ),
+    ],
+)  # fmt: skip
+def test_contradictions_within_a_file_are_refused_at_their_place(refusal, a, b, text):
+    """The master would refuse the submission, and could not name the line."""
+    entries = f"processes:\n  - {{name: a, command: x, {a}}}\n  - {{name: b, command: x, {b}}}"
+    assert text in refusal(load_work, f"\n{entries}")
+
+
 def test_a_circle_of_starts_is_refused_at_its_place(file):
     """The chain names all processes of the circle."""
     path = file(
@@ -233,7 +288,7 @@ def test_a_circle_of_starts_is_refused_at_its_place(file):
         defaults: {command: x}
         processes:
           - {name: a, after: {other: ready, b: finished}}
-          - {name: b, after: [c]}
+          - {name: b, after: [c], kind: job}
           - {name: c, after: a}
         """
     )
@@ -250,7 +305,7 @@ def test_a_start_order_of_an_entry_for_many_processes(file):
             """
             defaults: {command: x, after: {delay: 2s}}
             processes:
-              - {name: "view_{i}", foreach: {i: [1, 2]}, after: "cam_{i}"}
+              - {name: "view_{i}", foreach: {i: [1, 2]}, after: "cam_{i}", kind: job}
               - {name: map, after: {"view_{x}": finished}, foreach: [{x: 1}]}
             """
         )

@@ -188,6 +188,16 @@ def test_devices_in_arguments_and_parameters(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_devices_in_command_and_environment(tmp_path: Path) -> None:
+    """A user who writes all words under `command` gets the same."""
+    launched = order(
+        tmp_path, (HeldDevice("camera", "front"),), Device("camera", "front", "/dev/video0"),
+        command=("see", "{device.camera}"), environment={"SOURCE": "{device.camera}"},
+    )  # fmt: skip
+    assert launched.argv == ("see", "/dev/video0")
+    assert launched.environment["SOURCE"] == "/dev/video0"
+
+
 def test_an_assignment_without_its_device_is_refused(tmp_path: Path) -> None:
     """The process would use a device that another process holds."""
     with pytest.raises(LaunchError, match="p#1: it was assigned without a camera"):

@@ -1,0 +1,62 @@
+"""Placeholders in the texts of a process, which the host that runs the process replaces."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator
+from typing import Final
+
+from rosrm.wording import get_close_matches
+
+#: Fields of a process in which placeholders stand.
+WITH_PLACEHOLDERS: Final = (
+    "command", "arguments", "parameters", "environment", "working_directory",
+)  # fmt: skip
+#: Name of the directory with the artifacts of the process.
+ARTIFACTS: Final = "artifacts"
+#: Beginning of the name of a device: `device.camera`.
+DEVICE: Final = "device."
+#: A placeholder with its name in a group.
+PLACEHOLDER: Final = re.compile(r"\{(artifacts|device\.[^{}]*)\}")
+
+#: A text in braces that may be a misspelt placeholder.
+_IN_BRACES: Final = re.compile(r"\{([A-Za-z_]+)((?:[./][^{}]*)?)\}")
+#: Similarity from which a word counts as misspelt.
+_MISSPELT: Final = 0.75
+
+
+def placeholder_faults(text: str, known: Collection[str]) -> Iterator[str]:
+    """Yield a sentence on each placeholder in a text that no host can replace.
+
+    Otherwise the program would get the placeholder itself.
+
+    Args:
+        known: names of the placeholders of the process, such as "artifacts" and "device.camera".
+    """
+    for word, rest in _IN_BRACES.findall(text):
+        name = f"{word}{rest}"
+        if name in known or not _is_meant(word, rest):
+            continue
+        kind = name.removeprefix(DEVICE)
+        if name == ARTIFACTS:
+            yield "{artifacts} needs `artifacts:` in the process"
+            continue
+        close = get_close_matches(name, [*known, ARTIFACTS], 1)
+        meant = f"; did you mean {{{close[0]}}}?" if close else ""
+        if kind != name:
+            asked = [one.removeprefix(DEVICE) for one in known if one.startswith(DEVICE)]
+            yield (
+                f"{{{name}}} needs a device of the kind {kind!r}, which the process does not ask "
+                f"for; its `devices:` are {', '.join(asked) or 'none'}{meant}"
+            )
+        else:
+            yield (
+                f"{{{name}}} is unknown{meant or '.'} Allowed: {{artifacts}} with `artifacts:` in "
+                "the process, and {device.KIND} with `devices:`"
+            )
+
+
+def _is_meant(word: str, rest: str) -> bool:
+    """Return True if a text in braces is a placeholder, or a misspelt one."""
+    stems = [ARTIFACTS, DEVICE.rstrip(".")] if rest.startswith(".") else [ARTIFACTS]
+    return bool(get_close_matches(word, stems, 1, _MISSPELT))
