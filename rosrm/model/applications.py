@@ -125,7 +125,8 @@ class ApplicationRow:
 
     Attributes:
         version: number of the desired version; 0: it is cancelled.
-        pending: name of each process that is not yet as desired, to the reason.
+        pending: name of each process that is not yet as desired, to the reason; also of one whose
+            host has not reported since the master started.
         running: number of its processes that run, or have finished.
         processes: number of its processes.
         reason: why it is not as desired; "": it is.

@@ -83,6 +83,7 @@ class ProcessRow:
             "unreachable", "stuck" or "unknown" (its host is silent and not lost yet).
         host: host of the owning instance, of the image, or of the last run; "" for none.
         number: number of the owning instance; 0: none.
+        migrations: number of its moves; a replacement by a new version of the program is none.
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
             process runs.
         queue_position: 1: head; 0: not in the queue.

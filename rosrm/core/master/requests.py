@@ -143,7 +143,7 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
         return "; ".join(_in_use(state, taken))
     for spec in event.specs:
         if spec.name in state.processes or spec.name in state.unowned_instances:
-            left = _still_stopping(state, spec.name)
+            left = still_stopping(state, spec.name)
             if left:
                 return left
     return ""
@@ -169,7 +169,7 @@ def _names(names: list[str]) -> str:
     return f"the name {names[0]} is" if len(names) == 1 else f"the names {listed(names)} are"
 
 
-def _still_stopping(state: MasterState, name: str) -> str:
+def still_stopping(state: MasterState, name: str) -> str:
     """Return a sentence on an earlier instance that may still run; "" for none."""
     process = state.processes.get(name)
     numbers = state.unowned_instances.get(name) if process is None else process.instances
@@ -324,7 +324,7 @@ def _restart_fault(state: MasterState, process: Process) -> str:
     if process.name in state.migrations:
         return why_busy(state.migrations[process.name])
     if process.is_at_rest or process.image is not None:
-        return _still_stopping(state, process.name)
+        return still_stopping(state, process.name)
     if process.wanted is not DesiredState.RUN:
         return f"{process.name} is being stopped"
     if process.phase is ProcessPhase.UNREACHABLE:

@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Reply
-from rosrm.model.applications import Action
+from rosrm.model.applications import Action, ApplicationRow
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import SetRestartPolicy, StartInstance
 from rosrm.model.requester import Requester
@@ -18,6 +19,7 @@ from rosrm.model.values import (
     InstanceStatus,
     MigrationPolicy,
     ProcessSpec,
+    Readiness,
     RestartPolicy,
 )
 from tests.unit.core.cluster import Cluster, Machine, job, movable, process
@@ -53,6 +55,12 @@ def state_of(cluster: Cluster, name: str = "nav") -> tuple[int, list[str]]:
     """Return the desired version of an application, and its open tasks."""
     application = cluster.state.applications[name]
     return application.wanted, list(application.tasks)
+
+
+def row(cluster: Cluster, name: str = "nav") -> ApplicationRow:
+    """Return an application as clients list it."""
+    (found,) = [one for one in application_rows(cluster.state) if one.name == name]
+    return found
 
 
 # --- apply ------------------------------------------------------------------------------------
@@ -461,6 +469,48 @@ def test_a_name_of_another_application_is_refused_as_a_whole() -> None:
     assert "nav" not in cluster.state.applications
 
 
+@pytest.mark.parametrize("plan", [False, True])
+def test_the_refusal_of_a_name_says_how_it_gets_free(plan: bool) -> None:
+    """By a change of the other application; a process that is being stopped needs none."""
+    cluster = Cluster(Machine("a", stubborn={"q"}))
+    cluster.apply("map", process("p"), process("q"))
+    reply = cluster.apply("nav", process("p"), plan=plan)
+    assert "remove it from the file of map and apply that first" in reply.message
+    cluster.apply("map", process("p"))
+    reply = cluster.apply("nav", process("q"), plan=plan)
+    assert "it is being cancelled: try again once it has ended" in reply.message
+    assert "nav" not in cluster.state.applications
+
+
+def test_an_operator_gives_no_process_of_one_user_to_the_application_of_another() -> None:
+    """The refusal names the owner, and the command that frees the name of an ended process."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), by=ADA)
+    cluster.ask(happened.SubmissionReceived, (process("q"),), BOB)
+    reply = cluster.apply("nav", process("p"), process("q"))
+    assert "nav cannot have q, which is a process of user:bob already" in reply.message
+    cluster.cancel("q")
+    reply = cluster.apply("nav", process("p"), process("q"))
+    assert "it has ended, and `rosrm prune q` removes it" in reply.message
+    cluster.ask(happened.PruneRequested, ("q",), ())
+    assert cluster.apply("nav", process("p"), process("q")).accepted
+
+
+def test_a_process_starts_after_the_end_of_an_instance_that_no_process_owns() -> None:
+    """No name has two instances, also where the journal was lost with the process."""
+    cluster = Cluster(Machine("a", stubborn={"p"})).with_processes(process("p"))
+    cluster.kill_master()
+    cluster.intents["process"].clear()
+    cluster.restart_master()
+    cluster.apply("nav", process("p"))
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["a"]
+    assert row(cluster).pending == {"p": "an earlier p#1 is still being stopped on a"}
+    cluster.let_go("p")
+    cluster.wait(3.0)
+    assert (cluster.where("p"), row(cluster).state) == (["a"], "running")
+
+
 def test_a_process_of_an_application_is_not_submitted() -> None:
     """The refusal names the command."""
     cluster = Cluster("a")
@@ -512,6 +562,40 @@ def test_a_killed_master_goes_on_with_the_replacement(killed_after: int) -> None
     assert [program(cluster, name) for name in "pqr"] == [("new",)] * 3
     assert (cluster.where("gone"), len(cluster.where("added"))) == ([], 1)
     assert state_of(cluster) == (2, [])
+
+
+def test_an_application_is_judged_once_its_hosts_have_reported_again() -> None:
+    """After a restart of the master it is not degraded until a host reports, or its lease ends."""
+    cluster = Cluster("a", "b").with_processes(process("filler"))
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    (host,) = cluster.where("p")
+    (other,) = {"a", "b"} - {host}
+    cluster.kill_master()
+    cluster.rejoin(other)
+    assert (row(cluster).state, row(cluster).pending) == (
+        "applying", {"p": f"{host} has not reported since the master started"},
+    )  # fmt: skip
+    cluster.rejoin(host)
+    assert (row(cluster).state, row(cluster).pending) == ("running", {})
+    cluster.kill_master()
+    cluster.cut(host)
+    cluster.rejoin(other, 30.0)
+    assert (row(cluster).state, row(cluster).reason) == (
+        "degraded",
+        f"p is unreachable: {host} is lost",
+    )
+
+
+def test_an_application_is_not_degraded_while_a_process_of_it_moves() -> None:
+    """A process that moves to another host runs."""
+    cluster = Cluster("a")
+    cluster.apply("nav", movable("p", ros=True, readiness=Readiness(timeout=20.0)))
+    cluster.discover("p")
+    cluster.wait(1.0)
+    cluster.add(Machine("b"))
+    assert cluster.migrate("p").accepted
+    assert (cluster.phase("p"), row(cluster).state) == ("migrating", "running")
 
 
 # --- plans ------------------------------------------------------------------------------------

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.applications import Application, Version
+from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.model.applications import ApplicationRow, ApplicationState, VersionRow
 from rosrm.wording import few
 
-#: Phases of a process that is as its application wants it.
-_WELL = (ProcessPhase.RUNNING, ProcessPhase.SCHEDULED, ProcessPhase.FINISHED)
+#: Phases of a process that is as its application wants it; one that moves runs.
+_WELL = (
+    ProcessPhase.RUNNING, ProcessPhase.MIGRATING, ProcessPhase.SCHEDULED, ProcessPhase.FINISHED,
+)  # fmt: skip
 
 
 def application_rows(state: MasterState) -> list[ApplicationRow]:
@@ -21,8 +24,9 @@ def _row(state: MasterState, application: Application) -> ApplicationRow:
     unwell = {
         name: why for name in application.specs if (why := _why_unwell(state, application, name))
     }
-    pending = {name: task.fault or task.reason for name, task in application.tasks.items()}
-    condition = _condition(application, unwell)
+    tasks = {name: task.fault or task.reason for name, task in application.tasks.items()}
+    pending = unknown_processes(state, application) | tasks
+    condition = _condition(application, pending, unwell)
     first = [f"{name} {why}" for name, why in unwell.items()]
     return ApplicationRow(
         application.name, application.principal, condition, application.wanted,
@@ -32,10 +36,29 @@ def _row(state: MasterState, application: Application) -> ApplicationRow:
     )  # fmt: skip
 
 
-def _condition(application: Application, unwell: dict[str, str]) -> ApplicationState:
+def unknown_processes(state: MasterState, application: Application) -> dict[str, str]:
+    """Return the desired processes whose state is not known since the master started, and why.
+
+    Their hosts have reported neither yet, nor are they lost: most of them run.
+    """
+    found: dict[str, str] = {}
+    if not (state.hosts.condition == HostCondition.EXPECTED).any():
+        return found
+    for name in application.specs:
+        process = state.processes.get(name)
+        for number in process.instances if process is not None else ():
+            host = state.instances[number].host
+            if state.hosts.condition_of(host) is HostCondition.EXPECTED:
+                found[name] = f"{host.name} {state.hosts.why_unreachable(host)}"
+    return found
+
+
+def _condition(
+    application: Application, pending: dict[str, str], unwell: dict[str, str]
+) -> ApplicationState:
     if application.paused:
         return "paused"
-    if application.tasks:
+    if pending:
         return "returning" if application.returning else "applying"
     if not application.wanted:
         return "cancelled"

@@ -21,6 +21,7 @@ from rosrm.core.master.requests import count, submission_fault
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.applications import Application, Version
+from rosrm.core.master.state.process import DesiredState, Process
 from rosrm.model.applications import Action, PlannedAction, Target
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.requester import Requester
@@ -92,11 +93,11 @@ def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> l
     prepared = []
     for target, version in zip(targets, versions, strict=True):
         specs: Mapping[str, ProcessSpec] = {} if version is None else version.specs
-        _check_names(state, target.application, specs, by)
-        own = state.names_of(target.application)
-        found = differences(state, target.application, specs, own)
         application = state.applications.get(target.application)
         known = application or Application(target.application, by.name)
+        _check_names(state, known, specs, by)
+        own = state.names_of(target.application)
+        found = differences(state, target.application, specs, own)
         prepared.append(Prepared(known, version, found))
     _check_specs(state, prepared, by)
     return prepared
@@ -170,25 +171,35 @@ def _earlier_version(application: Application, number: int, by: Requester, wall:
 
 
 def _check_names(
-    state: MasterState, name: str, specs: Mapping[str, ProcessSpec], by: Requester
+    state: MasterState, application: Application, names: Iterable[str], by: Requester
 ) -> None:
     """Refuse names that other applications, users or single processes have."""
-    live = [
-        process
-        for one in specs
-        if (process := state.processes.get(one)) is not None and not process.phase.is_terminal
-    ]
-    check_rights([state.processes[one] for one in specs if one in state.processes], by)
-    others = [one for one in live if one.spec.application != name]
-    if others:
-        of = others[0].spec.application
+    known = [process for name in names if (process := state.processes.get(name)) is not None]
+    check_rights(known, by)
+    for process in known:
+        of, is_live = process.spec.application, not process.phase.is_terminal
+        if process.principal == application.principal and (of == application.name or not is_live):
+            continue
         whose = f"of the application {of}" if of else "a single process"
-        first = others[0].name
-        remedy = f"`rosrm cancel {first}` ends it" if not of else "choose another name"
+        if process.principal != application.principal:
+            whose = f"a process of {process.principal or 'an unknown owner'}"
         raise RequestRefused(
-            f"{name} cannot have {first}, which is {whose} already; {remedy}. Nothing was changed",
+            f"{application.name} cannot have {process.name}, which is {whose} already; "
+            f"{_remedy(process)}. Nothing was changed",
             "name_taken",
         )
+
+
+def _remedy(process: Process) -> str:
+    """Return how the name of a live process gets free."""
+    if process.phase.is_terminal:
+        return f"it has ended, and `rosrm prune {process.name}` removes it"
+    if process.wanted is DesiredState.CANCEL:
+        return "it is being cancelled: try again once it has ended"
+    of = process.spec.application
+    if of:
+        return f"remove it from the file of {of} and apply that first, or choose another name"
+    return f"`rosrm cancel {process.name}` ends it"
 
 
 def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester) -> None:

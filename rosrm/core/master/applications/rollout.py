@@ -32,7 +32,7 @@ from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.dependants import dependants_first
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.requests import add_process
+from rosrm.core.master.requests import add_process, still_stopping
 from rosrm.core.master.schedules import await_first_run
 from rosrm.core.master.state.applications import Application, Task
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
@@ -125,8 +125,10 @@ def _advance_ended(
     spec: ProcessSpec, now: float,
 ) -> bool:  # fmt: skip
     """Start a process that does not run; if this was done before, judge its end."""
+    task.reason = still_stopping(state, spec.name)
     if process is not None and state.may_run(process):
-        task.reason = "waits until its former instance has ended"
+        task.reason = task.reason or "waits until its standby has ended"
+    if task.reason:
         return False
     if task.begun and _has_ended(process, spec):
         if process is not None and process.phase is ProcessPhase.FAILED:
