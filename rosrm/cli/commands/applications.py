@@ -94,7 +94,8 @@ def _before(client: Client, application: str) -> int:
     found = [one.number for one in row.versions if one.number < wanted and not one.given_up]
     if not found:
         raise ConfigError(
-            f"--to: {application} has no version before {wanted}; see `rosrm history {application}`"
+            f"{application} has no version before {wanted} that was not given up. `rosrm history "
+            f"{application}` lists the versions, and `--to N` applies any of them"
         )
     return found[-1]
 
@@ -158,7 +159,7 @@ def history(
     if as_json:
         json_forms.show(json_forms.forms(row.versions))
     else:
-        tables.show(applications.versions(row.versions))
+        tables.show(applications.versions(row))
 
 
 COMMANDS: Final = (apply, revert, apps, history)

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from rosrm.cli.output.plain import echo
 from rosrm.cli.output.tables import state, table
-from rosrm.model.applications import ApplicationRow, PlannedAction, VersionRow
+from rosrm.model.applications import ApplicationRow, PlannedAction
 from rosrm.wording import counted, few, listed
 
 
@@ -44,15 +44,23 @@ def applications(rows: Sequence[ApplicationRow]) -> Table:
     return made
 
 
-def versions(rows: Sequence[VersionRow]) -> Table:
+def versions(application: ApplicationRow) -> Table:
     """Return the table of `rosrm history`, the newest version first."""
     made = table("VERSION", "REQUESTED", "BY", "PROCESSES", "NOTE", right=("VERSION", "PROCESSES"))
-    for row in reversed(rows):
+    for row in reversed(application.versions):
         when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row.wall_time))
         given_up = f"given up: {row.given_up}" if row.given_up else ""
-        note = "; ".join(filter(None, ("desired" * row.wanted, row.note, given_up)))
+        wanted = _standing(application) if row.wanted else ""
+        note = "; ".join(filter(None, (wanted, row.note, given_up)))
         made.add_row(str(row.number), when, Text(row.by), str(row.processes), Text(note))
     return made
+
+
+def _standing(row: ApplicationRow) -> str:
+    """Return the note on the desired version."""
+    if row.state == "running":
+        return "desired"
+    return f"desired, {row.state}" + (f": {row.reason}" if row.reason else "")
 
 
 def _pending(row: ApplicationRow) -> str:

@@ -34,6 +34,7 @@ from rosrm.core.supervisor.instance import (
     stopping,
 )
 from rosrm.core.supervisor.rules import RestartRule
+from rosrm.model.durations import LONGEST
 from rosrm.wording import counted
 
 _KILL: Final = len(STEPS) - 1
@@ -331,8 +332,8 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
     done = _recent_restarts(instance, now)
     if done >= rule.attempts:
         most = counted(rule.attempts, "restart")
-        limit = f"its restart policy allows {most} within {rule.window:g} s"
-        end(instance, FAILED, f"{ending}; {limit}")
+        within = f" within {rule.window:g} s" if rule.window < LONGEST else ""
+        end(instance, FAILED, f"{ending}; its restart policy allows {most}{within}")
         return
     wait = backoff(rule, done) * (1.0 - _JITTER * _chance(instance))
     instance.phase = BACKOFF

@@ -281,6 +281,36 @@ def test_a_stateful_process_waits_for_room_and_a_stateless_one_is_stopped_first(
     assert "no host has room for the new version of p beside the old" in task.reason
 
 
+def test_a_finished_service_is_not_as_desired() -> None:
+    """The application is degraded, and the next apply starts the service again; a job is done."""
+    cluster = Cluster("a")
+    parts = (process("p", restart=RestartPolicy("never")), job("done"))
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.finish("p", code=0)
+    cluster.finish("done")
+    cluster.wait(1.0)
+    (row,) = application_rows(cluster.state)
+    assert (row.state, row.running, row.processes) == ("degraded", 1, 2)
+    assert row.reason == "p has finished, but is a service: `rosrm apply` starts it again"
+    assert actions(cluster.apply("nav", *parts)) == {"p": "start"}
+
+
+def test_a_new_version_of_a_service_that_finishes_is_given_up() -> None:
+    """It ends within `healthy_for`, although without an error."""
+    cluster = Cluster("a")
+    spec = movable("p", restart=RestartPolicy("never"))
+    cluster.apply("nav", spec)
+    cluster.wait(1.0)
+    cluster.apply("nav", new(spec), healthy_for=5.0)
+    cluster.wait(2.0)
+    cluster.finish("p", code=0)
+    cluster.wait(10.0)
+    assert (program(cluster, "p"), state_of(cluster)) == (("run", "it"), (1, []))
+    given_up = cluster.state.applications["nav"].versions[2].given_up
+    assert given_up == "p: it has finished, but is a service"
+
+
 def test_the_same_request_in_the_middle_changes_nothing() -> None:
     """The new version is watched for `healthy_for` from its start on, and given up if it fails."""
     cluster = Cluster("a")
@@ -342,7 +372,13 @@ def test_a_version_that_fails_is_given_up() -> None:
     assert state_of(cluster) == (1, [])
     (returned,) = cluster.recorded("application_returns")
     assert returned.startswith("nav returns from version 2 to 1: p: it failed")
-    assert cluster.state.applications["nav"].versions[2].given_up
+    given_up = cluster.state.applications["nav"].versions[2].given_up
+    warning = f". Warning: version 2 was the same, and given up: {given_up}"
+    again = cluster.apply("nav", *map(new, parts), healthy_for=5.0, plan=True)
+    assert given_up
+    assert again.message.endswith(warning)
+    reverted = cluster.apply("nav", version=2)
+    assert reverted.message.endswith(warning)
 
 
 @pytest.mark.parametrize("other", ["a single process", "another user's"])

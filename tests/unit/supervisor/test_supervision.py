@@ -47,6 +47,7 @@ from rosrm.core.supervisor.instance import (
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS, backoff
 from rosrm.model import values
+from rosrm.model.durations import LONGEST
 from rosrm.supervisor import messages
 
 TALKER = ("talker", 7)
@@ -186,6 +187,13 @@ def test_backoff_grows_to_its_bound_and_restarts_run_out():
     assert [0.8 * most <= wait <= most for wait, most in zip(waits, (1, 2, 4, 5, 5), strict=True)]
     assert instance.message == "exit code 1; its restart policy allows 5 restarts within 300 s"
     assert instance.restarts == 5
+
+
+def test_restarts_of_a_whole_run_are_worded_without_a_window():
+    """So `retries` of a job allows them: its window is longer than any run."""
+    core, instance = started(restart=RestartRule("on-failure", attempts=0, window=LONGEST))
+    core.handle(Exited(TALKER, 1), 1.0)
+    assert instance.message == "exit code 1; its restart policy allows no restarts"
 
 
 def test_a_long_run_starts_the_backoff_afresh():

@@ -8,7 +8,7 @@ from operator import attrgetter
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.core.master.state.process import DesiredState, Process
 from rosrm.model.applications import Action
 from rosrm.model.values import ProcessSpec
 
@@ -90,7 +90,7 @@ def _of_ended(process: Process, spec: ProcessSpec) -> Difference | None:
     A change that needs no new start does not repeat a job.
     """
     changed = changed_fields(process.spec, spec)
-    if process.phase is ProcessPhase.FINISHED and IN_PLACE.issuperset(changed):
+    if process.is_finished_job and IN_PLACE.issuperset(changed):
         return None
     return Difference(Action.START, changed, f"it is {process.phase.value} now")
 

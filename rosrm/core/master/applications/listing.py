@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.model.applications import ApplicationRow, ApplicationState, VersionRow
-from rosrm.wording import few
+from rosrm.wording import few, standing
 
 #: Phases of a process that is as its application wants it; one that moves runs.
-_WELL = (
-    ProcessPhase.RUNNING, ProcessPhase.MIGRATING, ProcessPhase.SCHEDULED, ProcessPhase.FINISHED,
-)  # fmt: skip
+_WELL: Final = (ProcessPhase.RUNNING, ProcessPhase.MIGRATING, ProcessPhase.SCHEDULED)
 
 
 def application_rows(state: MasterState) -> list[ApplicationRow]:
@@ -70,10 +70,12 @@ def _why_unwell(state: MasterState, application: Application, name: str) -> str:
     process = state.processes.get(name)
     if process is None or process.spec.application != application.name:
         return "does not exist any more"
-    if process.phase in _WELL:
+    if process.phase in _WELL or process.is_finished_job:
         return ""
+    if process.phase is ProcessPhase.FINISHED:
+        return "has finished, but is a service: `rosrm apply` starts it again"
     reason = f": {process.reason}" if process.reason else ""
-    return f"is {process.phase.value}{reason}"
+    return f"{standing(process.phase.value)}{reason}"
 
 
 def _version_row(application: Application, version: Version) -> VersionRow:

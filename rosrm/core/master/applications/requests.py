@@ -286,4 +286,14 @@ def _summary_of(one: Prepared) -> str:
         return f"{name} {what}: nothing changes"
     numbers = Counter(found.action for found in one.found.values())
     parts = [f"{count(number)} to {action.value}" for action, number in numbers.items()]
-    return f"{name}{f' version {version.number}' if version else ''}: {listed(parts)}"
+    title = f"{name}{f' version {version.number}' if version else ''}"
+    return f"{title}: {listed(parts)}{_given_up_before(one)}"
+
+
+def _given_up_before(one: Prepared) -> str:
+    """Return a warning of a version with the same processes that was given up; "" for none."""
+    for former in reversed(one.application.versions.values()):
+        same = one.version is not None and former.specs == one.version.specs
+        if same and (why := former.given_up):
+            return f". Warning: version {former.number} was the same, and given up: {why}"
+    return ""

@@ -133,6 +133,8 @@ def _advance_ended(
     if task.begun and _has_ended(process, spec):
         if process is not None and process.phase is ProcessPhase.FAILED:
             task.fault = f"it failed: {process.reason}"
+        elif process is not None and process.phase is ProcessPhase.FINISHED:
+            task.fault = "" if process.is_finished_job else "it has finished, but is a service"
         return not task.fault
     _begin(state, application, task)
     version = application.version
@@ -222,7 +224,8 @@ def _runs_well(
     if process.phase is ProcessPhase.SET_ASIDE and task.replaces and application.former:
         task.fault = f"it is set aside: {process.reason}"
     elif process.phase is ProcessPhase.BACKOFF or (run[0] == task.run[0] and run != task.run):
-        task.fault = f"it does not run well: {process.reason or 'it was restarted'}"
+        why = process.reason.partition("; restart ")[0] or "it was restarted"
+        task.fault = f"it does not run well: {why}"
     elif process.phase is ProcessPhase.SCHEDULED:
         return True
     elif is_running and process.name not in state.migrations:

@@ -15,7 +15,7 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.lazy import Plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.values import GroupEnd, InstanceId, InstanceState, ProcessSpec
+from rosrm.model.values import GroupEnd, InstanceId, InstanceState, Kind, ProcessSpec
 
 #: Principal and name of a gang.
 GangKey = tuple[str, str]
@@ -295,6 +295,11 @@ class Process:
     def is_at_rest(self) -> bool:
         """Return True if nothing of it runs or waits for a host: terminal, or between two runs."""
         return self.phase.is_terminal or self.phase is ProcessPhase.SCHEDULED
+
+    @property
+    def is_finished_job(self) -> bool:
+        """Return True for a job that has done its work; a finished service should run."""
+        return self.phase is ProcessPhase.FINISHED and self.spec.kind is Kind.JOB
 
     @property
     def gang(self) -> GangKey | None:
