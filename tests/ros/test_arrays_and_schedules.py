@@ -75,7 +75,7 @@ def test_a_job_starts_again_every_second_and_another_waits_for_its_time(
     assert (row.exit_code, row.host, row.next_run > 0.0) == (0, "a", True)
     reason = cluster.wait("daily", "scheduled").reason
     assert reason.startswith("next run at 03:00 ")
-    assert "`rosrm restart daily` starts a run now" in cluster.client.explain("daily")["reason"]
+    assert "`rosrm restart daily` starts a run now" in cluster.client.explain("daily")["advice"]
     cluster.client.restart(["daily"])
     cluster.wait_for_event("finished", process="daily")
     cluster.wait("daily", "scheduled")

@@ -17,7 +17,8 @@ _DECIDED: Final = {
     "assigned": "The master assigned {process} to {host}{ago}",
     "migrated": "The master chose {host} as the destination of a move of {process}{ago}",
     "stayed": "The master chose {host} as the destination of a move{ago}, and the move was undone",
-    "waits": "{process} waits for a host",
+    "waits": "No host can take {process} now",
+    "fits": "{host} could take {process} now",
     "set_aside": "No host may take {process}",
 }
 _STYLES: Final = {"chosen": "green", "vetoed": "yellow", "excluded": "red", "full": "yellow"}
@@ -49,7 +50,7 @@ def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield _sentence(explanation["process"], decision)
         yield _needs(decision.get("need") or {})
         if decision.get("hosts"):
-            yield _hosts(decision["hosts"])
+            yield _hosts(decision)
         for reason, count in (decision.get("omitted") or {}).items():
             if count:
                 yield Text(f"and {counted(count, 'more host')} {reason}", "dim")
@@ -70,8 +71,9 @@ def _headline(explanation: Mapping[str, Any]) -> Text:
     text = tables.sentence(explanation["process"], explanation["state"])
     if explanation.get("host"):
         text.append(f" on {explanation['host']}")
-    if explanation.get("reason"):
-        text.append(f": {explanation['reason']}")
+    reason = "; ".join(filter(None, (explanation.get("reason"), explanation.get("advice"))))
+    if reason:
+        text.append(f": {reason}")
     if explanation.get("owner"):
         text.append(f"\nOwner: {explanation['owner']}")
     return text
@@ -161,11 +163,11 @@ def _defaults(defaults: Mapping[str, Any]) -> Text:
     return Text(f"From `defaults.process` of the cluster: {', '.join(fields)}.")
 
 
-def _hosts(hosts: list[Mapping[str, Any]]) -> RenderableType:
+def _hosts(decision: Mapping[str, Any]) -> RenderableType:
     made = tables.table("HOST", "", "SCORE", "WHY", right=("SCORE",))
-    for host in hosts:
+    for host in decision["hosts"]:
         score = host.get("score")
-        verdict = host["verdict"]
+        verdict = host["verdict"] if decision["kind"] != "fits" else "fits"
         made.add_row(
             Text(host["name"]),
             Text(verdict, _STYLES.get(verdict, "")),

@@ -14,6 +14,7 @@ from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.process_defaults import defaulted_values
 from rosrm.core.master.schedules import why_scheduled
+from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
@@ -30,6 +31,8 @@ _CONDITION: Final = {
     HostCondition.EXPECTED: "expected",
     HostCondition.DETACHED: "detached",
 }
+#: Most names of a gang in a command.
+_MOST_NAMED: Final = 8
 #: Conditions in which a host reports; a host that leaves reports until its instances have ended.
 _REPORTING: Final = (HostCondition.UP, HostCondition.LEFT)
 _OUT_OF_REACH: Final = (HostCondition.LOST, HostCondition.DETACHED)
@@ -184,13 +187,11 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
     row = process_row(state, process, now)
     decision, age = process.decision, now - process.decided_at
     if process.phase in WAITING:
-        current = decide_now(state, process)
-        current.kind = "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
-        decision, age = current, 0.0
-    reasons = (_reason(state, process, row), _advice(state, process))
+        decision, age = decide_now(state, process), 0.0
+        decision.kind = _kind_of_wait(process, decision)
     return {
         "process": name, "state": row.state, "host": row.host, "owner": row.owner,
-        "reason": "; ".join(filter(None, reasons)),
+        "reason": _reason(state, process, row), "advice": _advice(state, process),
         "decision": None if decision is None else {**decision, "elapsed": age},
         "limits": _limits(state, process),
         "defaults": defaulted_values(process.spec, process.defaulted),
@@ -202,6 +203,13 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
             for at, kind, message in process.history
         ],
     }  # fmt: skip
+
+
+def _kind_of_wait(process: Process, decision: Decision) -> DecisionKind:
+    """Return what the hosts mean for a waiting process; one that fits may wait for another."""
+    if decision.column >= 0:
+        return "fits"
+    return "waits" if process.phase is ProcessPhase.QUEUED else "set_aside"
 
 
 def _limits(state: MasterState, process: Process) -> Mapping[str, Any]:
@@ -281,11 +289,21 @@ def _advice(state: MasterState, process: Process) -> str:
     again = _advice_to_try_again(process) if process.phase in WAITING else ""
     if process.phase is ProcessPhase.SET_ASIDE:
         aside = (
-            f"it is queued again when such a host registers; to change what it needs, run "
-            f"`rosrm cancel {process.name}` and submit it again"
+            f"it is queued again when such a host registers; {_advice_to_change(state, process)}"
         )
         return f"{aside}; {again}" if again else aside
     return again
+
+
+def _advice_to_change(state: MasterState, process: Process) -> str:
+    """Return how to change the needs of a process that is set aside, with all of its gang."""
+    aim = "to change what it needs"
+    if process.spec.application:
+        return f"{aim}, change its file and `rosrm apply` it again"
+    gang = state.gangs.of(process)
+    names = " ".join(gang) if len(gang) <= _MOST_NAMED else "FILE"
+    them = "it" if len(gang) == 1 else f"all of the gang {process.spec.together}"
+    return f"{aim}, run `rosrm cancel {names}` and submit {them} again"
 
 
 def _advice_to_try_again(process: Process) -> str:

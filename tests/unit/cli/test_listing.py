@@ -368,6 +368,24 @@ def explained(rosrm, client):
     return lines
 
 
+@pytest.mark.parametrize(
+    ("kind", "says"),
+    [
+        ("fits", "alpha could take talker now."), ("waits", "No host can take talker now."),
+        ("set_aside", "No host may take talker."),
+    ],
+)  # fmt: skip
+def test_explain_does_not_contradict_itself_about_a_waiting_process(explained, kind, says):
+    """A host is chosen only by an assignment; the advice follows the reason."""
+    decision = {**STORY["decision"], "kind": kind, "elapsed": 0.0}
+    text = "\n".join(
+        explained(state="queued", reason="waits for x", advice="try", decision=decision)
+    )
+    assert says in text
+    assert ("chosen" in text) == (kind != "fits")
+    assert "talker is queued on alpha: waits for x; try" in text
+
+
 def test_explain_says_that_older_events_are_left_out_and_where_they_are(explained):
     assert "left out" not in "\n".join(explained())
     newer = [{"elapsed": 2.0, "kind": "ready", "message": "talker is ready on alpha"}]

@@ -174,6 +174,11 @@ def test_a_gang_of_which_one_process_fits_nowhere_is_set_aside_as_a_whole() -> N
     assert cluster["sensing-0"].reason.startswith(
         "no hosts may take all 2 of the gang sensing: sensing-1: "
     )
+    explained = cluster.explain("sensing-0")
+    assert explained["decision"]["kind"] == "fits"  # a host could take this one alone
+    assert explained["advice"].endswith(
+        "run `rosrm cancel sensing-0 sensing-1` and submit all of the gang sensing again"
+    )
     cluster.add(machine("c", labels={"arm": "yes"}))
     cluster.wait(1.0)
     assert phases(cluster) == ["running"] * 2

@@ -513,16 +513,17 @@ def test_a_node_is_starting_until_the_ros_graph_shows_it() -> None:
 
 
 def test_an_explanation_has_the_next_command() -> None:
-    """The reason names `logs` and `restart` for a failed process.
+    """The advice names `logs` and `restart` for a failed process.
 
     For an unreachable one it names the slave to start.
     """
     cluster = Cluster("a")
     cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
     cluster.finish("p", code=2)
-    assert cluster.explain("p")["reason"] == (
-        "exit code 2; `rosrm logs p` shows its output, `rosrm restart p` starts it again, "
+    assert cluster.explain("p")["reason"] == "exit code 2"
+    assert cluster.explain("p")["advice"] == (
+        "`rosrm logs p` shows its output, `rosrm restart p` starts it again, "
         "`rosrm submit FILE` replaces it by a corrected one"
     )
     cluster.detach("a")
-    assert cluster.explain("q")["reason"].endswith("; start the slave of a again")
+    assert cluster.explain("q")["advice"] == "start the slave of a again"

@@ -52,6 +52,7 @@ def test_a_process_starts_when_its_dependency_is_ready_and_blocks_no_other_until
     assert (cluster.phase("viewer"), cluster.phase("camera")) == ("queued", "starting")
     assert cluster.where("other") == ["a"]
     assert cluster["viewer"].reason == cluster.explain("viewer")["reason"] == why
+    assert cluster.explain("viewer")["decision"]["kind"] == "fits"
     cluster.wait(1.0)
     assert cluster.recorded("waits") == [f"viewer {why}"]
     cluster.discover("camera")

@@ -38,8 +38,8 @@ _NAMED_HOSTS: Final = 16
 _NO_REASON: Final = "a plugin refused it that gives no reason now; see `rosrm plugins`"
 #: Reason against a host that fails a filter of `OF_ROOM`, where a text must not change at once.
 NO_ROOM: Final = "it has no room"
-#: Kind of a decision; "": not set yet.
-DecisionKind = Literal["", "assigned", "set_aside", "waits", "migrated"]
+#: Kind of a decision; "": not set yet; "fits": a host could take a process that waits.
+DecisionKind = Literal["", "assigned", "set_aside", "waits", "fits", "migrated"]
 
 
 @dataclass(frozen=True, slots=True)
