@@ -220,7 +220,7 @@ class ProcessInFile:
         "restart": ("always", "{when: on-failure, attempts: 3}"),
         "needs": ("{memory: 200MB, cpu: 0.5}",),
         "labels": ("{required: {camera: front}}",),
-        "migration": ("handoff",),
+        "migration": ("{strategy: NAME}",),
         "readiness": ("running", "{timeout: 10s}"),
         "stop": ("{interrupt_grace: 5s}",),
         "host_loss": ("elsewhere", "{then: elsewhere, delay: 10s}"),

@@ -4,6 +4,7 @@ values.py               processes, hosts, instances, resources
 applications.py         applications: targets, planned actions, rows
 modes.py                modes: sets of applications of which one is in force
 artifacts.py            files and directories that processes get on their hosts
+placeholders.py         placeholders in the texts of a process, which its host replaces
 devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave
@@ -21,6 +22,7 @@ job_checks.py           rules for arrays and schedules
 limits.py               rules for limits and scheduling of a process
 container_rules.py      rules for the container of a process
 secret_rules.py         rules for the secrets of a process
-dependencies.py         circles of processes that start after each other
+dependencies.py         rules on processes that start after each other
+contradictions.py       contradictions between rules on neighbours
 description_checks.py   checks of the description of a host, and of names
 """
