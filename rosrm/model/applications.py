@@ -88,10 +88,13 @@ class ApplyResult:
     Attributes:
         message: the master's message.
         actions: actions that follow, or would follow; (): everything is as desired.
+        work: digest of the requested work, which tells a plan from that of other work; "": the
+            work was not sent by this client.
     """
 
     message: str
     actions: tuple[PlannedAction, ...] = ()
+    work: str = ""
 
 
 #: Condition of an application.

@@ -5,7 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -18,13 +19,21 @@ from rosrm.errors import ConfigError
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
-    from rosrm.model.applications import ApplyResult
+    from rosrm.model.applications import ApplyResult, Target
 
 Application = Annotated[str, typer.Argument(metavar="APP", help="Name of an application.")]
 Plan = Annotated[
     bool,
     typer.Option(
         "--plan", help="Show the actions, and begin none; exit 2 if there are any, 0 if not."
+    ),
+]
+AsPlanned = Annotated[
+    str,
+    typer.Option(
+        "--as-planned",
+        metavar="PLAN",
+        help="Begin only if PLAN, the output of `--plan --json`, still holds; say what differs.",
     ),
 ]
 NoWait = Annotated[bool, typer.Option("--no-wait", help="End once the master has accepted it.")]
@@ -40,6 +49,7 @@ def apply(  # noqa: PLR0917 - an argument for each option
         typer.Argument(metavar="WORK...", help="work.yaml with `app: NAME`; - is standard input."),
     ],
     plan: Plan = False,
+    as_planned: AsPlanned = "",
     no_wait: NoWait = False,
     timeout: Timeout = "",
     as_json: AsJson = False,
@@ -51,15 +61,34 @@ def apply(  # noqa: PLR0917 - an argument for each option
     replaced, and all others are not touched. Without --plan: waits for the result, and exits with 1
     if an application is not as described then.
     """
+    from rosrm.cli.planned import read_plan
     from rosrm.config.work import load_application
 
     targets = [load_application(file) for file in files]
+    planned = read_plan(as_planned) if as_planned else None
 
     def ask(client: Client) -> ApplyResult:
-        return client.apply_targets(targets, plan_only=plan)
+        if planned is None:
+            return client.apply_targets(targets, plan_only=plan)
+        return _as_planned(client, targets, planned, plan_only=plan)
 
     names = [target.application for target in targets]
     _carry_out(ctx, names, ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
+
+
+def _as_planned(
+    client: Client, targets: Sequence[Target], planned: ApplyResult, *, plan_only: bool
+) -> ApplyResult:
+    """Apply targets if a kept plan still holds, and print what differs by other readings.
+
+    Return the actions with the hosts that are planned now.
+    """
+    from rosrm.cli.planned import differences
+
+    now = client.apply_targets(targets, plan_only=True)
+    for text in differences(planned, now):
+        echo(f"rosrm: other readings than at the time of the plan: {text}", err=True)
+    return now if plan_only else replace(client.apply_targets(targets), actions=now.actions)
 
 
 def revert(  # noqa: PLR0917 - an argument for each option
@@ -106,6 +135,7 @@ def _carry_out(
 ) -> None:  # fmt: skip
     """Send a request on applications; show its plan, or wait for its end."""
     from rosrm.cli.output import applications, json_forms, tables
+    from rosrm.cli.planned import elsewhere
     from rosrm.cli.waiting import interruptible, longest
 
     limit = longest(timeout)
@@ -125,6 +155,9 @@ def _carry_out(
             rows = client.wait_for_applications(
                 names, timeout=limit, on_change=applications.show_progress
             )
+        if any(action.host for action in result.actions):  # they are those of a plan
+            for text in elsewhere(result.actions, client.list_processes()):
+                echo(f"rosrm: other than planned: {text}", err=True)
     shown = [applications.show_end(row) for row in rows]
     if not all(shown):
         raise typer.Exit(1)

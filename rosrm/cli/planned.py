@@ -1,0 +1,83 @@
+"""Comparison of a kept plan with the plan of now, and of a plan with its result."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from rosrm.errors import ConfigError, Refused
+from rosrm.model.applications import Action, ApplyResult, PlannedAction
+from rosrm.model.codec import from_plain
+from rosrm.model.rows import ProcessRow
+from rosrm.wording import few, listed
+
+
+def read_plan(path: str) -> ApplyResult:
+    """Return the plan that `rosrm apply --plan --json` has printed into a file."""
+    try:
+        return from_plain(ApplyResult, json.loads(Path(path).read_bytes()))
+    except OSError as fault:
+        why = fault.strerror or str(fault)
+    except (UnicodeDecodeError, json.JSONDecodeError):
+        why = "the file is not JSON"
+    except (KeyError, TypeError, ValueError) as fault:
+        why = str(fault)
+    raise ConfigError(
+        f"--as-planned: {path}: {why}; `rosrm apply WORK --plan --json > FILE` writes a plan"
+    )
+
+
+def differences(planned: ApplyResult, now: ApplyResult) -> list[str]:
+    """Return the differences of two plans that only stem from readings.
+
+    Raises:
+        Refused: the work differs, or what is to be done with a process of it.
+    """
+    if planned.work != now.work:
+        raise Refused("the work differs from that of the plan; plan again. Nothing was changed")
+    others = _compared(planned.actions, now.actions, _what)
+    if others:
+        raise Refused(
+            f"other actions are needed now than at the time of the plan: {'; '.join(few(others))}. "
+            f"Plan again. Nothing was changed"
+        )
+    return _compared(planned.actions, now.actions, _text)
+
+
+def elsewhere(actions: Iterable[PlannedAction], rows: Iterable[ProcessRow]) -> list[str]:
+    """Return a sentence on each process that is on another host than planned."""
+    hosts = {row.name: row.host for row in rows}
+    return [
+        f"{one.process} is on {hosts[one.process]}; {one.host} was planned"
+        for one in actions
+        if one.host and hosts.get(one.process, one.host) not in {"", one.host}
+    ]
+
+
+def _compared(
+    planned: Iterable[PlannedAction], now: Iterable[PlannedAction],
+    described: Callable[[PlannedAction], str],
+) -> list[str]:  # fmt: skip
+    before = {one.process: text for one in planned if (text := described(one))}
+    after = {one.process: text for one in now if (text := described(one))}
+    return [
+        f"{name}: {before.get(name, 'no action')} was planned, now {after.get(name, 'no action')}"
+        for name in before | after
+        if before.get(name) != after.get(name)
+    ]
+
+
+def _what(action: PlannedAction) -> str:
+    """Return an action without its hosts; "" for a move, which readings decide."""
+    if action.action is Action.MOVE:
+        return ""
+    changed = f" (changed: {listed(action.fields)})" if action.fields else ""
+    return f"{action.action.value}{changed}"
+
+
+def _text(action: PlannedAction) -> str:
+    moves = action.before and action.host and action.before != action.host
+    there = f"from {action.before} to {action.host}" if moves else action.host or action.before
+    where = f"{'' if moves else ' on'} {there}" if there else ""
+    return f"{action.action.value}{where}{', and a wait' if action.waits else ''}"
