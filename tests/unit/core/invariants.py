@@ -76,7 +76,7 @@ def gangs_are_known(state: MasterState) -> None:
         for name in names:
             process = state.processes[name]
             assert process.gang == gang
-            assert process.phase in BEFORE_START
+            assert process.phase in (*BEFORE_START, ProcessPhase.UNREACHABLE)
 
 
 def known_places_are_current(state: MasterState) -> None:
