@@ -128,7 +128,7 @@ class _Reader:
             owner.successor = at
             self._owner[name] = self._coming[name]
             self.rollout.spans[self._owner[name]].active = at
-        elif event.kind in ("migrated", "ready") and owner and self._reached:
+        elif event.kind in ("migrated", "ready", "running") and owner and self._reached:
             owner.checked = min(owner.checked, at)
         elif event.kind == "instance_ended":
             for span in self._others(name):

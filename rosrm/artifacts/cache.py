@@ -10,6 +10,7 @@ incoming/                   archives that arrive, and their contents before they
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
@@ -20,12 +21,16 @@ from typing import Any, Final
 from rosrm.artifacts.unpack import CONTENT, is_intact, remove, unpack
 from rosrm.errors import Refused, TransferError
 from rosrm.model.artifacts import Artifact, set_key
+from rosrm.model.placeholders import ARTIFACTS
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.wording import size as sized
 
 #: Bytes of the disk that stay free.
 _RESERVE: Final = 100_000_000
+
+#: Directory in which a process sees its artifacts, as in messages about its program.
+_SET: Final = re.compile(r"/\S*/sets/[0-9a-f]{32}(?=/)")
 
 #: The artifacts of the processes that have not ended, one tuple for each.
 Used = Iterable[tuple[Artifact, ...]]
@@ -34,6 +39,14 @@ Used = Iterable[tuple[Artifact, ...]]
 def set_directory(root: Path, artifacts: Iterable[Artifact]) -> Path:
     """Return the directory in which a process sees its artifacts."""
     return root / "sets" / set_key(artifacts)
+
+
+def without_directories(text: str) -> str:
+    """Return a text with `{artifacts}` in place of directories of artifacts, as users know them.
+
+    So the messages of all hosts about one artifact are equal.
+    """
+    return _SET.sub(f"{{{ARTIFACTS}}}", text)
 
 
 class Incoming:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from pathlib import Path
@@ -30,6 +32,7 @@ from rosrm.extensions.registry import Registry
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.contradictions import contradiction_in
 from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
+from rosrm.model.placeholders import ARTIFACTS
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
 
@@ -267,6 +270,22 @@ def _check_sources(
             if fault:
                 place = node.deepest(("artifacts", one.name)).place
                 problems.add(place, f"artifacts.{one.name}: {fault}")
+        fault = _program_fault(spec) if spec is not None else ""
+        if fault:
+            problems.add(node.deepest(("command",)).place, f"command: {fault}")
+
+
+def _program_fault(spec: ProcessSpec) -> str:
+    """Return why no host can start an artifact that is the program; "": hosts can."""
+    program = spec.command[0] if spec.command else ""
+    sources = {f"{{{ARTIFACTS}}}/{one.name}": Path(one.source) for one in spec.artifacts}
+    source = sources.get(program)
+    if source is None or not source.is_file() or os.access(source, os.X_OK):
+        return ""
+    return (
+        f"{program} is not executable. Run `chmod +x {source.name}`, or begin the command with an "
+        f"interpreter: [python3, {json.dumps(program)}]"
+    )
 
 
 def _given(node: Node, value: Any, before: str = "") -> Iterator[str]:

@@ -398,6 +398,12 @@ class ProcessSpec:
         return tuple(name for name, value in settings.items() if value)
 
     @property
+    def awaits_graph(self) -> bool:
+        """True if an instance is ready when its node appears, False as soon as it runs."""
+        kind = self.readiness.kind
+        return kind == "graph" or (kind == "auto" and bool(self.ros))
+
+    @property
     def fetch_time(self) -> float:
         """Return the seconds that a move adds to the time-out of a start, for the artifacts."""
         return fetch_time(self.artifacts)

@@ -6,10 +6,12 @@ import contextlib
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
+from rosrm.artifacts.cache import without_directories
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
 from rosrm.core.supervisor import events as orders
@@ -181,7 +183,11 @@ class SupervisorLink:
                 logged = True
 
     def _take_messages(self, received: Sequence[SupervisorMessage]) -> None:
-        statuses = tuple(one for one in received if isinstance(one, InstanceStatus))
+        statuses = tuple(
+            replace(one, message=without_directories(one.message))
+            for one in received
+            if isinstance(one, InstanceStatus)
+        )
         for status in statuses:
             self._unanswered.pop(status.instance, None)
             self._follow(status)

@@ -207,8 +207,10 @@ def _follow(
     phase = _phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
-        # A job has no ready state: it runs to its end.
-        is_ready = phase is ProcessPhase.RUNNING and process.spec.kind is not Kind.JOB
+        # Nothing shows that a program without a node is ready: it may end at once. A job has no
+        # ready state, because it runs to its end.
+        shown = process.spec.awaits_graph and process.spec.kind is not Kind.JOB
+        is_ready = phase is ProcessPhase.RUNNING and shown
         kind = EventKind.READY if is_ready else _EVENT[phase]
         kind = EventKind.REACHABLE if repeated else kind
         state.record(

@@ -95,6 +95,7 @@ def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     phase, since = process.phase.value, now - process.since
     standby = process.standby_reason if process.phase is ProcessPhase.RUNNING else ""
     reason = _reason_of_phase(state, process) or standby or _awaited_node(process, owner)
+    reason = reason or _who_is_first(state, process)
     if owner is not None and silence is not None and process.phase in _OBSERVED:
         said = f"{owner.host.name} has been silent for {silence:.0f} s"
         phase, reason, since = "unknown", f"{said}; last known: {phase}", silence
@@ -128,6 +129,14 @@ def _reason_of_phase(state: MasterState, process: Process) -> str:
     run = f"{running} of the array {process.spec.array.name} run already" if running else ""
     next_ones = f"{len(taken) - running} of it are next" if len(taken) > running else ""
     return ", and ".join(filter(None, (run, next_ones)))
+
+
+def _who_is_first(state: MasterState, process: Process) -> str:
+    """Return a phrase on the head of the queue, which a process behind it waits for; "": none."""
+    first = state.queue.head()
+    if process.phase is not ProcessPhase.QUEUED or state.settings.backfill or first is None:
+        return ""
+    return "" if first == process.name else f"waits behind {first}"
 
 
 def _limit(process: Process, owner: Instance | None, name: str) -> float:

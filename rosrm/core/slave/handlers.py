@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from rosrm.core.slave import commands, events, fencing
 from rosrm.core.slave.health import InstanceHealth, watch_of
-from rosrm.core.slave.state import HeldInstance, SlaveState, awaits_graph
+from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.core.slave.watches import Awaited, Memo
 from rosrm.model.devices import title_of
 from rosrm.model.values import (
@@ -90,7 +90,7 @@ def _refused(
 def _waiting(assignment: Assignment) -> HeldInstance:
     spec = assignment.spec
     awaited = None
-    if awaits_graph(spec) and not assignment.restored:  # a restored node rejoins the graph later
+    if spec.awaits_graph and not assignment.restored:  # a restored node rejoins the graph later
         name = qualified_name(spec.namespace, assignment.node_name)
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)

@@ -178,9 +178,3 @@ def under_limits(
     if stale & present and ((stale & _SLOTS) != 0)[used].any():
         return False
     return bool((usage < limit)[used].all())
-
-
-def awaits_graph(spec: ProcessSpec) -> bool:
-    """Return True if an instance is ready when its node appears, False as soon as it runs."""
-    kind = spec.readiness.kind
-    return kind == "graph" or (kind == "auto" and bool(spec.ros))

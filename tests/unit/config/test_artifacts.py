@@ -33,8 +33,17 @@ def test_paths_are_relative_to_the_work_file(file, tmp_path):
 def test_a_program_in_the_artifacts_is_not_looked_up_beside_the_work_file(file):
     """`{artifacts}` at the beginning of a path is a directory on the host."""
     path = file(work("{run.sh: run.sh}", "'{artifacts}/run.sh'"))
-    (path.parent / "run.sh").touch()
+    (path.parent / "run.sh").touch(mode=0o755)
     assert load_work(path)[0].command == ("{artifacts}/run.sh",)
+
+
+def test_a_program_in_the_artifacts_must_be_executable(file):
+    """Otherwise each host would refuse it in turn."""
+    path = file(work("{run.sh: run.sh}", "'{artifacts}/run.sh'"))
+    (path.parent / "run.sh").touch(mode=0o644)
+    remedy = r"command: \{artifacts\}/run.sh is not executable. Run `chmod \+x run.sh`, or begin"
+    with pytest.raises(ConfigError, match=remedy):
+        load_work(path)
 
 
 def test_a_missing_file_is_an_error_at_its_place(file):

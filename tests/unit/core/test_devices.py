@@ -95,6 +95,15 @@ def test_a_device_is_given_to_one_process_until_it_is_gone() -> None:
     assert given(cluster) == {"q": ["camera front"]}
 
 
+def test_the_queue_says_which_device_it_waits_for() -> None:
+    """The first row names the holder of the device, the next ones the first process."""
+    cluster = Cluster(host("a", FRONT), host("b"))
+    cluster.with_processes(cam("p"), cam("q"), process("r"))
+    rows = {row.name: row.reason for row in listing.process_rows(cluster.state, cluster.now)}
+    assert rows["q"] == ("no host can take it now: a: camera: needs 1; camera front is held by p#1")
+    assert rows["r"] == "waits behind q"
+
+
 def test_the_record_of_an_assignment_names_the_devices() -> None:
     """Users find the devices of a process in `rosrm events`."""
     cluster = Cluster(host("a", FRONT)).with_processes(cam("p"))

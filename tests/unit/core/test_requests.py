@@ -494,11 +494,12 @@ def test_a_process_without_an_owner_is_cancelled_when_its_last_instance_has_ende
     assert cluster.phase("p") == "cancelled"
 
 
-def test_a_started_job_is_running_and_not_ready() -> None:
-    """Only a service becomes ready for others."""
-    cluster = Cluster("a").with_processes(process("p"), job("q"))
-    assert cluster.recorded("ready") == ["p is ready on a"]
-    assert cluster.recorded("running") == ["q is running on a"]
+def test_only_a_node_in_the_graph_is_recorded_as_ready() -> None:
+    """Any other program is running: it may end at once, such as a module that does not exist."""
+    cluster = Cluster("a").with_processes(process("p"), job("q"), node("r"))
+    cluster.discover("r", "a")
+    assert cluster.recorded("ready") == ["r is ready on a"]
+    assert cluster.recorded("running") == ["p is running on a", "q is running on a"]
 
 
 def test_a_node_is_starting_until_the_ros_graph_shows_it() -> None:

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 
+from rosrm.artifacts.cache import set_directory, without_directories
 from rosrm.artifacts.pack import Archive
 from rosrm.core.slave import reducer
 from rosrm.core.slave.events import SupervisorReplaced, SupervisorReported
@@ -149,6 +150,14 @@ def test_a_process_gets_the_directory_in_its_texts(host, offered, tmp_path):
     assert filled.arguments == (f"--in={directory}/x",)
     assert filled.parameters == {"files": [f"{directory}/x"]}
     assert (tmp_path / directory / "x").read_bytes().startswith(b"x")
+
+
+def test_messages_name_the_placeholder_instead_of_the_directory(tmp_path):
+    """So the messages of all hosts about one program are equal, and short."""
+    directory = set_directory(tmp_path / "host-1" / "artifacts", (Artifact("x", "0" * 64, 5),))
+    text = without_directories(f"{directory}/x cannot be started: it is not executable")
+    assert text == "{artifacts}/x cannot be started: it is not executable"
+    assert without_directories("no executable '/bin/sets/x' exists").endswith("exists")
 
 
 def test_a_busy_or_restarted_master_is_asked_again(host, offered):

@@ -34,7 +34,7 @@ from rosrm.core.slave.events import (
 )
 from rosrm.core.slave.handlers import REMEMBER_END
 from rosrm.core.slave.health import LOOK_PERIOD
-from rosrm.core.slave.state import SlaveState, awaits_graph, under_limits
+from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.core.slave.watches import Memo, Observation
 from rosrm.model.values import (
     Fence,
@@ -252,10 +252,10 @@ def test_a_node_is_ready_when_it_is_seen(one, shadow, name) -> None:
 
 def test_readiness_kinds() -> None:
     """`running` makes a node ready at once; with `graph` the slave awaits any process."""
-    assert not awaits_graph(replace(NODE, readiness=Readiness("running")))
-    assert awaits_graph(replace(PLAIN, readiness=Readiness("graph")))
-    assert awaits_graph(NODE)
-    assert not awaits_graph(PLAIN)
+    assert not replace(NODE, readiness=Readiness("running")).awaits_graph
+    assert replace(PLAIN, readiness=Readiness("graph")).awaits_graph
+    assert NODE.awaits_graph
+    assert not PLAIN.awaits_graph
 
 
 def test_an_instance_that_does_not_become_ready_is_stopped_and_has_failed(node) -> None:

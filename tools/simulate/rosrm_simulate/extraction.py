@@ -19,7 +19,6 @@ from rosrm.core.master.commands import Assign, Command, PublishStateConfig, Repl
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
-from rosrm.core.slave.state import awaits_graph
 from rosrm.model.codec import from_plain
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Record
@@ -189,7 +188,7 @@ class Extraction:
             self._runs_since[number] = at
             if number in self._assigned:
                 self._starts.append(at - self._assigned[number])
-        elif status.state is InstanceState.READY and awaits_graph(process.spec):
+        elif status.state is InstanceState.READY and process.spec.awaits_graph:
             self._readies.append(at - self._runs_since[number])
         elif status.state is InstanceState.STOPPING:
             self._stops_since.setdefault(number, at)

@@ -15,7 +15,6 @@ from math import inf
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import SendOrder
 from rosrm.core.slave.events import SeenInGraph
-from rosrm.core.slave.state import awaits_graph
 from rosrm.model.values import EMPTY, Assignment, InstanceId, InstanceState, RestartPolicy
 from rosrm_simulate.agenda import Agenda, Entry
 from rosrm_simulate.host import Host, Program, SimulatedReading
@@ -130,7 +129,7 @@ class Machine(Host[Work]):
         """Begin with the work of an instance; a ROS node is seen in the graph later."""
         program.begun = now
         self.changed(now)
-        if awaits_graph(program.assignment.spec):
+        if program.assignment.spec.awaits_graph:
             seen = partial(self._seen, program.assignment.instance, program.run)
             self.later(self._model.ready, now, seen)
 

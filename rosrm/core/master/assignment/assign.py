@@ -33,6 +33,7 @@ from rosrm.core.master.scheduling.feasibility import (
     refused_everywhere,
     why_all_away,
     why_never,
+    why_no_devices,
 )
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.demand import Demand
@@ -448,7 +449,7 @@ def _record_waiting(state: MasterState, process: Process, demand: Demand, now: f
         return
     room = state.preemption.room_made.get(process.name)
     made = room.reason if room is not None and room.host is not None else ""
-    reason = why_all_away(state.hosts, demand) or made or _why_waiting(process)
+    reason = why_all_away(state.hosts, demand) or made or _why_waiting(state, process)
     if process.reason != reason:
         state.note_decision(process, decide_now(state, process), "waits", now)
         _record_wait_reason(state, process, reason, now, {"decision": process.decision})
@@ -469,10 +470,11 @@ def _record_waiting_gang(
         process.reason = reason
 
 
-def _why_waiting(process: Process) -> str:
+def _why_waiting(state: MasterState, process: Process) -> str:
     failed = failures(process)
     no_host = f"it failed on {failed}, and no other host can" if failed else "no host can"
-    return f"{no_host} take it now"
+    devices = why_no_devices(state.hosts, process.spec.devices)
+    return f"{no_host} take it now" + (f": {devices}" if devices else "")
 
 
 def _record_wait_reason(

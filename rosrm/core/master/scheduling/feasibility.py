@@ -19,6 +19,7 @@ from rosrm.core.master.scheduling.filters import (
     refusals,
 )
 from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.devices import DeviceNeeds
 from rosrm.core.master.state.host_arrays import BoolArray
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.model.values import ProcessSpec
@@ -153,6 +154,23 @@ def _unknown_device(table: HostTable, demand: Demand) -> str:
             hint = f"; did you mean {near[0]!r}?" if near else ""
             return f"no host has a {need.kind!r} among its devices{hint} (there: {listed(there)})"
     return ""
+
+
+def why_no_devices(table: HostTable, needs: DeviceNeeds) -> str:
+    """Return who holds the devices that a process needs; "": nobody, or some host has free ones.
+
+    The first 16 hosts with such devices count.
+    """
+    held: list[tuple[str, str]] = []
+    for host in table.listed() if needs else ():
+        inventory = table.devices[host.column]
+        if inventory.choose(needs) is not None:
+            return ""
+        if inventory.emptied().choose(needs) is not None:
+            held.append((host.name, inventory.why_not(needs)))
+        if len(held) == _NAMED_HOSTS:
+            break
+    return by_reason(held)
 
 
 def _no_engine(table: HostTable, demand: Demand) -> str:
