@@ -159,7 +159,10 @@ def _carry_out(
             for text in elsewhere(result.actions, client.list_processes()):
                 echo(f"rosrm: other than planned: {text}", err=True)
     shown = [applications.show_end(row) for row in rows]
-    if not all(shown):
+    missing = set(names).difference(row.name for row in rows)
+    for name in sorted(missing):
+        echo(f"rosrm: {name} is no longer listed", err=True)
+    if missing or not all(shown):
         raise typer.Exit(1)
 
 

@@ -54,7 +54,7 @@ def requests(master):
 
 
 def test_a_plan_that_holds_is_applied(master, rosrm, work, kept):
-    """Nothing is said but what each apply says."""
+    """The output is that of each apply."""
     result = rosrm("apply", str(work), "--as-planned", str(kept))
     assert (result.code, result.err) == (0, "")
     assert result.out == "nav version 1\nnav is running at version 1\n"
@@ -106,6 +106,13 @@ def test_what_other_readings_change_is_said(master, rosrm, work, kept):
         f"{readings} other: no action was planned, now move from alpha to beta",
         "rosrm: other than planned: a is on gamma; beta was planned",
     ]
+
+
+def test_an_application_that_is_no_longer_listed_is_not_as_described(master, rosrm, work):
+    """For example after a loss of the journal: the command does not end with success."""
+    master.applications = []
+    result = rosrm("apply", str(work))
+    assert (result.code, result.err) == (1, "rosrm: nav is no longer listed\n")
 
 
 @pytest.mark.parametrize(
