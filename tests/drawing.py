@@ -86,6 +86,8 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "process": PROPER_NAMES,
     "together": st.just("") | PROPER_NAMES,
     "namespace": _NAMESPACES,
+    "node_name": st.sampled_from(["", "keep", "talker"]),
+    "nodes": st.sampled_from(["/**", "/*", "/robot/talker"]),
     "talks_to": st.dictionaries(PROPER_NAMES.map("to-{}".format), st.floats(0.0, 1e15), max_size=3),
     "start_order": st.builds(
         StartOrder,

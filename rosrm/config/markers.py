@@ -149,6 +149,8 @@ class Words:
         """
         if not isinstance(given, str):
             return tuple(given) if isinstance(given, list) else given
+        if "$(find-pkg-" in given:
+            raise ValueError(f"{given!r}: write a list of words where a package is named by $(…)")
         try:
             words = tuple(shlex.split(given))
         except ValueError as error:

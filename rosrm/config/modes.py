@@ -11,14 +11,15 @@ from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems, read
 from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
-from rosrm.config.process import ListOfWords, flattened
+from rosrm.config.process import ListOfWords
 from rosrm.config.rules import check_name, settled
 from rosrm.config.work import load_application
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Fraction, Quantity, ResourceName
 from rosrm.model.applications import Target
 from rosrm.model.modes import Mode, Trigger
-from rosrm.model.values import EMPTY, ProcessSpec
+from rosrm.model.parameters import flattened
+from rosrm.model.values import EMPTY, ParameterSource, ProcessSpec
 
 _CONDITIONS: Final = ("host_lost", "over_limit")
 _FOR: Final = Quantity("duration")
@@ -170,6 +171,9 @@ def _with_parameters(
 
     def changed(spec: ProcessSpec) -> ProcessSpec:
         own = dict(flattened(parameters.get(spec.name, EMPTY)))
+        if own and spec.parameter_sources:  # which override `parameters`
+            last = ParameterSource(parameters=own)
+            return replace(spec, parameter_sources=(*spec.parameter_sources, last))
         return replace(spec, parameters={**spec.parameters, **own}) if own else spec
 
     return tuple(replace(one, specs=tuple(map(changed, one.specs))) for one in targets)

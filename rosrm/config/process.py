@@ -8,6 +8,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, TypeVar
 
 from rosrm.config.device_forms import AskedByKind
 from rosrm.config.markers import NullIsEmpty, PlainWord, Words
+from rosrm.config.parameter_forms import ParametersInFile
 from rosrm.config.settings import DEFAULT_ENGINE
 from rosrm.config.start_order_forms import StartOrderInFile
 from rosrm.extensions.units import (
@@ -23,6 +24,7 @@ from rosrm.model.arrays import ArrayMembership
 from rosrm.model.artifacts import artifacts_of
 from rosrm.model.durations import LONGEST
 from rosrm.model.limits import LARGEST_CPU_NUMBER
+from rosrm.model.parameters import flattened
 from rosrm.model.schedules import SHORTEST, Schedule
 from rosrm.model.values import (
     EMPTY,
@@ -38,6 +40,7 @@ from rosrm.model.values import (
     Limits,
     MigrationPolicy,
     NeighbourRule,
+    ParameterSource,
     ProcessSpec,
     Readiness,
     ReadinessKind,
@@ -246,13 +249,17 @@ class ProcessInFile:
     }
 
     name: str
+    node_name: str = ""
     namespace: str = ""
     package: str | None = None
     executable: str | None = None
     module: str | None = None
     command: ListOfWords = ()
+    prefix: ListOfWords = ()
     arguments: ListOfWords = ()
-    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    parameters: Annotated[Mapping[str, Any] | tuple[ParameterSource, ...], ParametersInFile()] = (
+        field(default_factory=lambda: EMPTY)
+    )
     remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     environment: Mapping[str, Text] = field(default_factory=lambda: EMPTY)
     working_directory: str | None = None
@@ -303,10 +310,13 @@ class ProcessInFile:
         By default a service restarts on failure, for example after a power failure. A job does not
         restart, because it may not be repeatable.
         """
+        sources = self.parameters if isinstance(self.parameters, tuple) else ()
+        plain = self.parameters if isinstance(self.parameters, Mapping) else {}
         return _same(
             ProcessSpec,
             self,
-            parameters=dict(flattened(self.parameters)),
+            parameters=dict(flattened(plain)),
+            parameter_sources=sources,
             kind=Kind(self.kind),
             restart=self._restart_policy(),
             required_labels=self.labels.required,
@@ -362,12 +372,3 @@ def _same(wanted: type[_Value], of: Any, **others: Any) -> _Value:
     """Return a value of the core with the fields of its counterpart in the file, and `others`."""
     names = [f.name for f in fields(wanted) if f.name not in others]  # type: ignore[arg-type]
     return wanted(**{name: getattr(of, name) for name in names}, **others)
-
-
-def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield nested parameters by their dotted names, as in ROS."""
-    for name, value in parameters.items():
-        if isinstance(value, Mapping):
-            yield from flattened(value, f"{before}{name}.")
-        else:
-            yield f"{before}{name}", value

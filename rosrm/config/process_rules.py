@@ -12,7 +12,13 @@ from typing import Any, Final
 from rosrm.model.arrays import INDEX_PLACEHOLDER
 from rosrm.model.artifacts import artifacts_fault
 from rosrm.model.container_rules import container_fault
-from rosrm.model.description_checks import is_namespace, name_fault, other_process_fault
+from rosrm.model.description_checks import (
+    is_namespace,
+    is_node_name,
+    name_fault,
+    node_name_fault,
+    other_process_fault,
+)
 from rosrm.model.devices import need_fault
 from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import limits_fault
@@ -21,10 +27,9 @@ from rosrm.model.secret_rules import is_variable, secret_faults
 from rosrm.model.values import Kind, ProcessSpec, StartOrder
 from rosrm.wording import listed
 
-_NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
 _TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 _LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
-_ROS_ONLY: Final = ("namespace", "parameters", "remappings")
+_ROS_ONLY: Final = ("node_name", "namespace", "parameters", "remappings")
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +159,8 @@ def _about_placeholders(spec: ProcessSpec) -> Iterator[Complaint]:
     known += [ARTIFACTS] if spec.artifacts else []
     for key in WITH_PLACEHOLDERS:
         for fault in placeholder_faults(repr(getattr(spec, key)), known):
-            yield Complaint((key,), f"{key}: {fault}")
+            given = "parameters" if key == "parameter_sources" else key
+            yield Complaint((given,), f"{given}: {fault}")
 
 
 def _about_flows(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -190,6 +196,9 @@ def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
     if (health.topic or health.lifecycle) and not spec.ros:
         text = "health: only a ROS node has topics and a lifecycle; set `ros: true` if this is one"
         yield Complaint(("health",), text)
+    if (health.topic.startswith("~") or health.lifecycle) and spec.ros and not spec.node:
+        text = "health: the name of the node is required, and `node_name: keep` leaves it unknown"
+        yield Complaint(("health",), text)
 
 
 def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -213,7 +222,7 @@ def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
 
 def _about_others(spec: ProcessSpec) -> Iterator[Complaint]:
     for name in _ROS_ONLY:
-        if getattr(spec, name):
+        if getattr(spec, name) or (name == "parameters" and spec.parameter_sources):
             text = f"{name}: only a ROS node has one; set `ros: true` if this is one"
             yield Complaint((name,), text)
     if spec.readiness.kind == "graph":
@@ -222,12 +231,13 @@ def _about_others(spec: ProcessSpec) -> Iterator[Complaint]:
 
 
 def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
-    if not _NODE_NAME.fullmatch(spec.name):
-        allowed = "at most 200 letters, digits and '_', the first of them not a digit"
-        text = f"{spec.name!r} cannot be the name of a ROS node. Allowed: {allowed}"
+    if spec.node and not is_node_name(spec.node):
+        text = node_name_fault(spec.node)
         if spec.array.name:
             text += f"; write {{array.index}} into the name: {spec.array.name}_{{array.index}}"
-        yield Complaint(("name",), text)
+        elif not spec.node_name:
+            text += "; to give the node another name than the process, set `node_name`"
+        yield Complaint(("node_name" if spec.node_name else "name",), text)
     if spec.namespace and not is_namespace(spec.namespace):
         text = f"{spec.namespace!r} is not an absolute namespace such as '/robot1'"
         yield Complaint(("namespace",), text)
@@ -235,6 +245,11 @@ def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
         fault = _fault_of_parameter(value)
         if fault:
             yield Complaint(("parameters", *name.split(".")), f"parameters.{name}: {fault}")
+    for source in spec.parameter_sources:
+        for name, value in source.parameters.items():
+            fault = _fault_of_parameter(value)
+            if fault:
+                yield Complaint(("parameters",), f"parameters: {source.nodes} {name}: {fault}")
 
 
 def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -294,7 +309,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_ends, ("time_limit", "kind", "reschedule")),
     (_about_jobs, ("array", "parallel", "every", "at", "on", "kind")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
-    (_about_health, ("health", "ros", *_PROGRAM)),
+    (_about_health, ("health", "ros", "node_name", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_start_order, ("name", "after")),
     (_about_devices, ("devices",)),

@@ -72,8 +72,8 @@ def settled_on_host(path: str, file: str | Path) -> str:
     """Return a path for the host that runs a process.
 
     A relative path is joined to the file's directory. `~` stays for the slave, because the home of
-    its user may differ there, and so does `{artifacts}`.
+    its user may differ there, and so do `{artifacts}` and the directories of ROS packages.
     """
-    if path.startswith(("~", f"{{{ARTIFACTS}}}")):
+    if path.startswith(("~", f"{{{ARTIFACTS}}}", "$(find-pkg-")):
         return path
     return os.path.normpath(Path(file).absolute().parent / path)

@@ -188,6 +188,11 @@ def checked_defaults(
         for name, item in written_out(node).items.items()
         if name not in _NOT_IN_CLUSTER_DEFAULTS
     }
+    if "parameters" in own and isinstance(own["parameters"].value, tuple):
+        problems.add(
+            own["parameters"].place,
+            "defaults.process: parameters: only a process has a list of them",
+        )
     placeholder = {name: Node("default", node.place) for name in ("name", "package", "executable")}
     return _process(Node({**own, **placeholder}, node.place), path, plugins, problems)
 
@@ -322,8 +327,12 @@ def _on_host(spec: ProcessSpec, path: str | Path) -> ProcessSpec:
         spec = replace(spec, working_directory=settled_on_host(directory, path))
     if command and "/" in command[0]:
         spec = replace(spec, command=(settled_on_host(command[0], path), *command[1:]))
+    sources = tuple(
+        replace(one, file=settled_on_host(one.file, path)) if one.file else one
+        for one in spec.parameter_sources
+    )
     here = (
         replace(one, source=str(settled(Path(one.source), path))) if one.source else one
         for one in spec.artifacts
     )
-    return replace(spec, artifacts=tuple(here))
+    return replace(spec, artifacts=tuple(here), parameter_sources=sources)

@@ -5,6 +5,7 @@ applications.py         applications: targets, planned actions, rows
 modes.py                modes: sets of applications of which one is in force
 artifacts.py            files and directories that processes get on their hosts
 placeholders.py         placeholders in the texts of a process, which its host replaces
+parameters.py           ROS parameters from several sources, by patterns of nodes
 devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave

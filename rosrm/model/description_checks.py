@@ -17,6 +17,7 @@ from rosrm.model.values import (
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 _NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
 _LONGEST_NAMESPACE: Final = 255
+_NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
 _RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 #: Seconds: the longest period of readings.
 _LONGEST_PERIOD: Final = 3600.0
@@ -50,6 +51,17 @@ def other_process_fault(name: str, own: str) -> str:
 def is_namespace(text: str) -> bool:
     """Return True for an absolute ROS namespace such as "/robot1"."""
     return len(text) <= _LONGEST_NAMESPACE and _NAMESPACE.fullmatch(text) is not None
+
+
+def is_node_name(text: str) -> bool:
+    """Return True for a name that a ROS node may have."""
+    return _NODE_NAME.fullmatch(text) is not None
+
+
+def node_name_fault(text: str) -> str:
+    """Return why a text cannot be the name of a ROS node."""
+    allowed = "at most 200 letters, digits and '_', the first of them not a digit"
+    return f"{text!r:.250} cannot be the name of a ROS node. Allowed: {allowed}"
 
 
 def is_resource_name(name: str) -> bool:

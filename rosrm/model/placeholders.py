@@ -10,7 +10,8 @@ from rosrm.wording import get_close_matches
 
 #: Fields of a process in which placeholders stand.
 WITH_PLACEHOLDERS: Final = (
-    "command", "arguments", "parameters", "environment", "working_directory",
+    "command", "prefix", "arguments", "parameters", "parameter_sources", "environment",
+    "working_directory",
 )  # fmt: skip
 #: Name of the directory with the artifacts of the process.
 ARTIFACTS: Final = "artifacts"

@@ -306,7 +306,7 @@ def _step_fault(step: Step, move: Move) -> str:
 def _shadow_fault(step: Start, move: Move) -> str:
     if step.instance != move.destination:
         return "starts a shadow that is not the destination"
-    if step.node_name in ("", move.spec.name, move.source_node):
+    if step.node_name in ("", move.spec.node, move.source_node):
         return "starts a shadow without an alias"
     return ""
 

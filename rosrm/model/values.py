@@ -30,6 +30,11 @@ LARGEST_NUMBER: Final = 2**53
 #: Greatest rate of a flow or a link, in B/s.
 LARGEST_RATE: Final = 1e15
 
+#: `node_name` of a program whose nodes keep the names that it gives them.
+KEEP_NAME: Final = "keep"
+#: Pattern of all nodes in a source of parameters.
+ALL_NODES: Final = "/**"
+
 EMPTY: Final[Mapping[str, Any]] = MappingProxyType({})
 
 RestartCondition = Literal["never", "on-failure", "always"]
@@ -297,15 +302,33 @@ class Container:
 
 
 @dataclass(frozen=True, slots=True)
+class ParameterSource:
+    """ROS parameters of some nodes, or a file with parameters on the host of the process.
+
+    Attributes:
+        file: path of a ROS parameters file on the host; "": `parameters` are given.
+        nodes: pattern of the nodes that get `parameters`: "/robot/planner", "/robot/*", "/**".
+        parameters: by dotted names, values as in JSON.
+    """
+
+    file: str = ""
+    nodes: str = ALL_NODES
+    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the terms of ROS 2 launch.
 
     Exactly one of `package` with `executable`, `module` and `command` is given.
 
     Attributes:
-        name: unique among live processes; also the name of its ROS node.
+        name: unique among live processes.
+        node_name: name of its ROS node; "": the name of the process; "keep": the program's own.
         namespace: namespace of the node; "" or absolute.
+        prefix: words before the program in its command line.
         parameters: ROS parameters, values as in JSON.
+        parameter_sources: further parameters; a later source overrides earlier ones.
         remappings: ROS name to ROS name.
         ros: True for a ROS node, which gets its name, namespace, parameters and remappings; None
             becomes True for an executable of a ROS package, else False.
@@ -337,13 +360,16 @@ class ProcessSpec:
     """
 
     name: str
+    node_name: str = ""
     namespace: str = ""
     package: str | None = None
     executable: str | None = None
     module: str | None = None
     command: tuple[str, ...] = ()
+    prefix: tuple[str, ...] = ()
     arguments: tuple[str, ...] = ()
     parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    parameter_sources: tuple[ParameterSource, ...] = ()
     remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     environment: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     working_directory: str | None = None
@@ -387,6 +413,11 @@ class ProcessSpec:
         """Set the default of `ros`, which depends on `package`."""
         if self.ros is None:
             object.__setattr__(self, "ros", self.package is not None)
+
+    @property
+    def node(self) -> str:
+        """Return the name that its ROS node gets; "": its nodes keep their own names."""
+        return "" if self.node_name == KEEP_NAME else self.node_name or self.name
 
     @property
     def enforcement(self) -> tuple[str, ...]:

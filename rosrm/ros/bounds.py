@@ -58,6 +58,7 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.given": 256,
     "ProcessSpec.secrets": 256,
     "ProcessSpec.cpus": 1024,
+    "ProcessSpec.parameter_sources": 256,
     "HostDescription.unenforced": 16,
     "HostDescription.cpus": 4096,
     "ProcessStatus.enforced": 16,

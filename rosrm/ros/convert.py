@@ -19,8 +19,10 @@ from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import (
     description_fault,
     is_namespace,
+    is_node_name,
     is_resource_name,
     name_fault,
+    node_name_fault,
     other_process_fault,
 )
 from rosrm.model.devices import (
@@ -35,6 +37,7 @@ from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.modes import Mode, Trigger
+from rosrm.model.parameters import pattern_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
@@ -164,10 +167,15 @@ def _from_msg(wanted: type[_Value], message: Any, /, **others: Any) -> _Value:
 
 def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
     """Return a process spec as a message."""
-    parameters = spec.parameters.items()
     return _to_msg(
         msg.ProcessSpec, spec,
-        parameters=[msg.KeyValue(key=key, value=json.dumps(value)) for key, value in parameters],
+        parameters=_json_pairs(spec.parameters),
+        parameter_sources=[
+            msg.ParameterSource(
+                file=one.file, nodes=one.nodes, parameters=_json_pairs(one.parameters)
+            )
+            for one in spec.parameter_sources
+        ],
         needs=_amounts_to_msg(spec.needs),
         migration=_to_msg(
             msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
@@ -188,10 +196,11 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     spec = _from_msg(
         values.ProcessSpec, message,
-        parameters={
-            pair.key: _json_value(pair.value, f"parameter {pair.key}")
-            for pair in message.parameters
-        },
+        parameters=_parameters(message),
+        parameter_sources=tuple(
+            values.ParameterSource(one.file, one.nodes, _parameters(one))
+            for one in message.parameter_sources
+        ),
         needs={need.resource: need.amount for need in message.needs},
         migration=_from_msg(
             values.MigrationPolicy, message.migration,
@@ -204,6 +213,16 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec
+
+
+def _json_pairs(parameters: Mapping[str, Any]) -> list[msg.KeyValue]:
+    return [msg.KeyValue(key=key, value=json.dumps(value)) for key, value in parameters.items()]
+
+
+def _parameters(message: msg.ProcessSpec | msg.ParameterSource) -> dict[str, Any]:
+    return {
+        pair.key: _json_value(pair.value, f"parameter {pair.key}") for pair in message.parameters
+    }
 
 
 def target_to_msg(target: Target) -> msg.ApplicationTarget:
@@ -314,6 +333,11 @@ def _name_fault(message: msg.ProcessSpec) -> str:
     namespace = message.ros_namespace
     if namespace and not is_namespace(namespace):
         return f"{namespace!r:.250} is not an absolute namespace such as '/robot1'"
+    if message.node_name and not is_node_name(message.node_name):
+        return f"node_name: {node_name_fault(message.node_name)}"
+    for source in message.parameter_sources:
+        if not source.file and (fault := pattern_fault(source.nodes)):
+            return f"parameters: {fault}"
     if message.application and (fault := name_fault(message.application, "application")):
         return fault
     return name_fault(message.name, "process")

@@ -92,7 +92,7 @@ class MigrationContract:
             destination_host="b",
             fallback=InstanceId(self.spec.name, 3),
             now=1_700_000_000,
-            source_node=self.spec.name,
+            source_node=self.spec.node,
         )
         policies = [replace(self.spec.migration, overlap=overlap) for overlap in (True, False)]
         moves = [replace(move, spec=replace(self.spec, migration=policy)) for policy in policies]
@@ -202,7 +202,7 @@ class MigrationContract:
                 if isinstance(step, Stop) and step.instance == move.source:
                     stopped = True
                 if isinstance(step, Start) and step.instance == move.destination and not stopped:
-                    same_name = step.node_name in ("", move.spec.name)
+                    same_name = step.node_name in ("", move.spec.node)
                     assert plan.overlap > 0 or not same_name, (
                         "the destination starts before the source has stopped, and the plan "
                         "declares no overlap"

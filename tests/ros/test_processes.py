@@ -15,6 +15,7 @@ from rosrm.config.settings import LogSettings
 from rosrm.errors import Refused
 from rosrm.model.values import (
     Kind,
+    ParameterSource,
     ProcessSpec,
     Readiness,
 )
@@ -107,6 +108,45 @@ def test_name_parameters_and_remappings_reach_the_node(cluster, ament_prefix) ->
         "topic": "/elsewhere",
     }
     cluster.cancel("talker")
+
+
+def test_two_nodes_of_one_name_in_two_namespaces(cluster, tmp_path) -> None:
+    """Each process has a name of its own, and its node the parameters of its section, in order."""
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {rate: 1.0, text: file}}\n"
+        "/left/talker: {ros__parameters: {rate: 2.5}}\n"
+    )
+    sources = (
+        ParameterSource(parameters={"words": ["a"], "nested.flag": True, "text": "x"}),
+        ParameterSource(str(file)), ParameterSource(nodes="/right/*", parameters={"text": "last"}),
+    )  # fmt: skip
+    for side in ("left", "right"):
+        cluster.submit(
+            node(
+                f"{side}.talker", node_name="talker", namespace=f"/{side}", prefix=("nice",),
+                parameter_sources=sources,
+            )
+        )  # fmt: skip
+    found = {}
+    for side in ("left", "right"):
+        cluster.wait(f"{side}.talker", "running")
+        found[side] = said(cluster, f"{side}.talker")
+        cluster.cancel(f"{side}.talker")
+    given = {side: (it["name"], it["parameters"]) for side, it in found.items()}
+    common = {"words": ["a"], "nested.flag": True}
+    assert given == {
+        "left": ("/left/talker", {**common, "rate": 2.5, "text": "file"}),
+        "right": ("/right/talker", {**common, "rate": 1.0, "text": "last"}),
+    }
+
+
+def test_a_node_that_keeps_its_name_is_ready_by_its_process(cluster) -> None:
+    """The node is found by the pids of the instance, because its name is not known."""
+    cluster.submit(node("kept-name", node_name="keep", namespace="/deep"))
+    cluster.wait("kept-name", "running")
+    assert said(cluster, "kept-name")["name"] == "/deep/unnamed"
+    cluster.cancel("kept-name")
 
 
 def test_the_environment(cluster) -> None:

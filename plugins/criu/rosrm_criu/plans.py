@@ -156,7 +156,7 @@ def checkpoint_plan(move: Move, options: CriuOptions) -> Plan:
 def restore_plan(move: Move, options: CriuOptions) -> Plan:
     """Return a plan to restore the process; its image stays until that succeeds, which is final."""
     here = move.destination_host
-    alias = "" if move.source_node == move.spec.name else move.source_node
+    alias = "" if move.source_node == move.spec.node else move.source_node
     put_back = execute(move, here, PUT_BACK, options.restore_timeout)
     return Plan(
         (

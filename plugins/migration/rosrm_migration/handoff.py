@@ -121,6 +121,8 @@ class Handoff:
 def _fault(spec: ProcessSpec, options: HandoffOptions) -> str:
     if not spec.ros:
         return "it moves only ROS nodes, and this process is none: set `ros: true`"
+    if not spec.node:
+        return "it starts the node a second time by another name, and `node_name: keep` is set"
     if options.protocol == "paper" and not spec.migration.overlap:
         return "with `protocol: paper` both are active for a moment, and `overlap: false` is set"
     return ""
@@ -179,7 +181,7 @@ def _start(move: Move, options: HandoffOptions) -> Start:
 def _own_names(spec: ProcessSpec, options: HandoffOptions) -> dict[str, str]:
     """Return the remapping of a state topic below `~`, which otherwise moves with the alias."""
     namespace = spec.namespace.strip("/")
-    own = f"/{namespace}/{spec.name}/" if namespace else f"/{spec.name}/"
+    own = f"/{namespace}/{spec.node}/" if namespace else f"/{spec.node}/"
     if not options.state.startswith(own):
         return {}
     return {f"~/{options.state[len(own) :]}": options.state}
@@ -208,7 +210,7 @@ def _end(move: Move, options: HandoffOptions) -> tuple[Stop, Configure]:
 
 def alias_of(move: Move) -> str:
     """Return `NAME_<unix time>`, different from the name under which the source runs."""
-    name, at = move.spec.name, move.now
+    name, at = move.destination_spec.node, move.now
     while (alias := _suffixed(name, at)) in (name, move.source_node):
         at += 1
     return alias

@@ -36,7 +36,7 @@ def node_of(spec: ProcessSpec) -> str:
     rules = dict(
         word.split(":=", 1) for word in reversed(words) if word.startswith(("__node:=", "__ns:="))
     )
-    name = rules.get("__node") or (spec.name if spec.ros else "")
+    name = rules.get("__node") or (spec.node if spec.ros else "")
     if name:
         return f"the node {qualified_name(rules.get('__ns', spec.namespace), name)}"
     if spec.command[:2] == _RUN and len(spec.command) >= 4:

@@ -184,8 +184,9 @@ def _awaited_node(process: Process, owner: Instance | None) -> str:
     spec = process.spec
     if owner.state is not InstanceState.RUNNING or not spec.ros or spec.readiness.kind == "running":
         return ""
-    node = qualified_name(spec.namespace, owner.node_name or spec.name)
-    return f"waits for its node {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
+    name = owner.node_name or spec.node
+    node = f"its node {qualified_name(spec.namespace, name)}" if name else "a node of it"
+    return f"waits for {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
 
 
 def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] | None:

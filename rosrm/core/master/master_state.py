@@ -682,7 +682,7 @@ class MasterState:
             if not shadow and not restored:
                 snapshot_hosts = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(
-            instance, spec, self.epoch, node_name or spec.name, shadow, fence, snapshot_hosts,
+            instance, spec, self.epoch, node_name or spec.node, shadow, fence, snapshot_hosts,
             snapshots_from, restored, devices=known.devices if known else (),
         )  # fmt: skip
 

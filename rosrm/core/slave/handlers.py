@@ -91,7 +91,8 @@ def _waiting(assignment: Assignment) -> HeldInstance:
     spec = assignment.spec
     awaited = None
     if spec.awaits_graph and not assignment.restored:  # a restored node rejoins the graph later
-        name = qualified_name(spec.namespace, assignment.node_name)
+        name = assignment.node_name
+        name = qualified_name(spec.namespace, name) if name else ""
         awaited = Awaited(name, spec.readiness.timeout)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
     watch, fenced = watch_of(assignment), assignment.fence is not None
@@ -379,9 +380,10 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
         awaited = held.awaited
         if held.ready_by is not None and now >= held.ready_by and awaited is not None:
             held.ready_by = None
+            node = " ".join(filter(None, ("no node", awaited.node_name)))
             held.unready = (
-                f"not ready within {awaited.timeout:g} s: no node {awaited.node_name} of "
-                f"this instance was seen in the ROS graph"
+                f"not ready within {awaited.timeout:g} s: {node} of this instance was seen in the "
+                f"ROS graph"
             )
             orders.append(commands.Stop(instance))
         elif held.status.state.ended and _may_be_discarded(state, held, now):

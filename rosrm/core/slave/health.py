@@ -46,7 +46,7 @@ def watch_of(assignment: Assignment) -> Watch | None:
 def _names(name: str, assignment: Assignment, scheme: str) -> tuple[str, ...]:
     """Return absolute names: resolved for the node's visible name, then for its alias, if any."""
     spec = assignment.spec
-    nodes = dict.fromkeys((spec.name, assignment.node_name))
+    nodes = dict.fromkeys((spec.node, assignment.node_name))
     resolved = (resolve(name, spec.namespace, node, spec.remappings, scheme) for node in nodes)
     return tuple(dict.fromkeys(resolved))
 

@@ -22,7 +22,7 @@ class Awaited:
     """Readiness of an instance whose node must appear in the ROS graph.
 
     Attributes:
-        node_name: fully qualified name of its node.
+        node_name: fully qualified name of its node; "": a node of any name.
         timeout: seconds in which the node of each run must appear.
         seen: pid of the run whose node has appeared; 0: none.
     """

@@ -32,8 +32,11 @@ class GraphWatch:
         self._host = b""
 
     def endpoints(self, name: str) -> frozenset[bytes]:
-        """Return the GIDs of all nodes' endpoints under a fully qualified name, as known now."""
-        return frozenset(gid for owner, gid in self._all() if owner == name)
+        """Return the GIDs of all nodes' endpoints under a fully qualified name, as known now.
+
+        "": under any name.
+        """
+        return frozenset(gid for owner, gid in self._all() if name in ("", owner))
 
     def sees(self, name: str, pids: Iterable[int], before: frozenset[bytes]) -> bool:
         """Return True if the instance that runs as one of `pids` has a node of this full name.

@@ -35,7 +35,7 @@ def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> 
     Raises:
         LaunchError: not found; the message has the searched places and similar names.
     """
-    prefix = _find_package(package, prefixes)
+    prefix = find_package(package, prefixes)
     path = prefix / "lib" / package / executable
     if not path.is_file():
         near = _near(executable, _executables(path.parent))
@@ -48,7 +48,8 @@ def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> 
     return path
 
 
-def _find_package(package: str, prefixes: Sequence[Path]) -> Path:
+def find_package(package: str, prefixes: Sequence[Path]) -> Path:
+    """Return the prefix of a package; raises `LaunchError` with the searched places."""
     for prefix in prefixes:
         if (prefix / _PACKAGES / package).is_file():
             return prefix

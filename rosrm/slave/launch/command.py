@@ -6,6 +6,7 @@ The order consists of command line, environment and parameters.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -17,6 +18,8 @@ from rosrm.slave.launch.artifacts import with_artifacts
 from rosrm.slave.launch.devices import with_devices
 from rosrm.slave.launch.environment import ProcessLocation, process_environment
 from rosrm.slave.launch.launchers import Launchers
+from rosrm.slave.launch.packages import with_packages
+from rosrm.slave.launch.parameter_files import all_parameters
 from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ros_arguments
 from rosrm.supervisor import json_lines
 from rosrm.supervisor.client import log_path
@@ -54,8 +57,12 @@ def launch_order(
     assignment = with_artifacts(with_devices(assignment, where.devices), where.artifacts)
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
+    filled = with_packages(spec, ament_index.search_path(environment, python))
+    if filled != spec:
+        spec, assignment = filled, replace(assignment, spec=filled)
+        environment = process_environment(assignment, base_environment, where, launchers.variables)
     try:
-        command = _command(spec, environment, python)
+        command = (*spec.prefix, *_command(spec, environment, python))
         arguments = _arguments(assignment, state_directory)
     except (OSError, ValueError) as error:  # a folder of another user, a text without encoding
         raise LaunchError(f"{assignment.instance}: {error}") from None
@@ -149,7 +156,7 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
 
     None: there are no parameters.
     """
-    text = parameters_text(assignment.spec.parameters)
+    text = parameters_text(all_parameters(assignment.spec, assignment.spec.node))
     if not text:
         return None
     path = log_path(state_directory, assignment.instance).with_suffix(".parameters.yaml")

@@ -95,8 +95,8 @@ def process_environment(
     environment["ROSRM_EPOCH"] = str(assignment.epoch)
     if where.epoch_file is not None:
         environment[EPOCH_FILE] = str(where.epoch_file)
-    if spec.ros:  # the name without the alias
-        environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.name)
+    if spec.ros and spec.node:  # the name without the alias
+        environment["ROSRM_NODE"] = qualified_name(spec.namespace, spec.node)
     if spec.array.name:
         environment[INDEX_VARIABLE] = str(spec.array.index)
     if assignment.shadow:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from rosrm.model.placeholders import PLACEHOLDER, WITH_PLACEHOLDERS
-from rosrm.model.values import Assignment
+from rosrm.model.values import Assignment, ParameterSource, ProcessSpec
 
 
 def filled(assignment: Assignment, values: Mapping[str, str]) -> Assignment:
@@ -17,16 +17,27 @@ def filled(assignment: Assignment, values: Mapping[str, str]) -> Assignment:
     """
     if not values:
         return assignment
-    spec = assignment.spec
-    texts = {name: _filled(getattr(spec, name), values) for name in WITH_PLACEHOLDERS}
-    return replace(assignment, spec=replace(spec, **texts))
+
+    def change(text: str) -> str:
+        return PLACEHOLDER.sub(lambda found: values.get(found[1], found[0]), text)
+
+    return replace(assignment, spec=with_texts(assignment.spec, change))
 
 
-def _filled(value: Any, values: Mapping[str, str]) -> Any:
+def with_texts(spec: ProcessSpec, change: Callable[[str], str]) -> ProcessSpec:
+    """Return a spec with changed texts in the fields in which placeholders stand."""
+    texts = {name: _changed(getattr(spec, name), change) for name in WITH_PLACEHOLDERS}
+    return replace(spec, **texts)
+
+
+def _changed(value: Any, change: Callable[[str], str]) -> Any:
     if isinstance(value, str):
-        return PLACEHOLDER.sub(lambda found: values.get(found[1], found[0]), value)
+        return change(value)
     if isinstance(value, (list, tuple)):
-        return type(value)(_filled(one, values) for one in value)
+        return type(value)(_changed(one, change) for one in value)
     if isinstance(value, Mapping):
-        return {key: _filled(one, values) for key, one in value.items()}
+        return {key: _changed(one, change) for key, one in value.items()}
+    if isinstance(value, ParameterSource):
+        parameters = _changed(value.parameters, change)
+        return replace(value, file=change(value.file), parameters=parameters)
     return value

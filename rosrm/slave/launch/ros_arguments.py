@@ -20,8 +20,11 @@ _LARGEST: Final = 2**63
 
 
 def ros_arguments(spec: ProcessSpec, node_name: str, parameters_file: str | None) -> list[str]:
-    """Return name, namespace, remappings and parameters, to append to the user's arguments."""
-    arguments = [_BEGIN, "-r", f"__node:={node_name}"]
+    """Return name, namespace, remappings and parameters, to append to the user's arguments.
+
+    `node_name`: "": the nodes keep their own names.
+    """
+    arguments = [_BEGIN, *(("-r", f"__node:={node_name}") if node_name else ())]
     if spec.namespace:
         namespace = spec.namespace if spec.namespace.startswith("/") else f"/{spec.namespace}"
         arguments += ["-r", f"__ns:={namespace}"]
@@ -29,7 +32,7 @@ def ros_arguments(spec: ProcessSpec, node_name: str, parameters_file: str | None
         arguments += ["-r", f"{source}:={target}"]
     if parameters_file is not None:
         arguments += ["--params-file", parameters_file]
-    return arguments
+    return arguments if arguments != [_BEGIN] else []
 
 
 def join_arguments(arguments: Sequence[str], ros: Sequence[str]) -> list[str]:
@@ -43,16 +46,19 @@ def join_arguments(arguments: Sequence[str], ros: Sequence[str]) -> list[str]:
     return [*arguments, *([_END] if is_open else []), *ros]
 
 
-def parameters_text(parameters: Mapping[str, Any]) -> str:
-    """Return a parameters file (YAML) for the only node of the process, with any name.
+def parameters_text(sections: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a parameters file (YAML) from the parameters of each pattern of nodes.
 
     Without values the result is "", because ROS 2 rejects an empty file.
 
     Raises:
         LaunchError: a ROS parameter cannot hold a value.
     """
-    lines = _mapping(parameters, "", 2)
-    return "\n".join(['"/**":', "  ros__parameters:", *lines, ""]) if lines else ""
+    lines = []
+    for nodes, parameters in sections.items():
+        inner = _mapping(parameters, "", 2)
+        lines += [f"{_text(nodes)}:", "  ros__parameters:", *inner] if inner else []
+    return "\n".join([*lines, ""]) if lines else ""
 
 
 def _mapping(parameters: Mapping[str, Any], path: str, depth: int) -> list[str]:

@@ -17,6 +17,7 @@ from rosrm.model.values import (
     Limits,
     MigrationPolicy,
     NeighbourRule,
+    ParameterSource,
     ProcessSpec,
     Readiness,
     Realtime,
@@ -144,6 +145,17 @@ def test_every_key_is_read(file):
         ("command: x, after: []", "start_order", StartOrder()),
         ("module: m", "ros", False),
         ("module: m, ros: true, remappings: [[a, b]]", "remappings", {"a": "b"}),
+        ("module: m, ros: true, parameters: {a: {b: 1}}", "parameters", {"a.b": 1}),
+        (
+            "module: m, ros: true, parameters: [/p, {a: {b: 1}}, {/n: {ros__parameters: {c: 1}}}]",
+            "parameter_sources",
+            (
+                ParameterSource("/p"),
+                ParameterSource(parameters={"a.b": 1}),
+                ParameterSource(nodes="/n", parameters={"c": 1}),
+            ),
+        ),
+        ("command: x, prefix: nice -n 5", "prefix", ("nice", "-n", "5")),
     ],
 )
 def test_shorthands_stand_for_the_long_forms(file, entry, field, value):
@@ -449,6 +461,18 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, command: x, readiness: graph", "only a ROS node is seen in the graph"),
         ("name: a, module: x, ros: true, namespace: b", "'b' is not an absolute namespace"),
         ("name: a, module: x, ros: true, parameters: {b: }", "parameters.b: a value is required"),
+        ("name: a, module: x, ros: true, parameters: 5", "parameters: a mapping is required"),
+        ("name: a, module: x, ros: true, parameters: [5]", "parameters: entry 1: the path of a"),
+        ("name: a, module: x, ros: true, parameters: [{a: }]", "parameters: /** a: a value is"),
+        ("name: a, command: x, parameters: [{a: 1}]", "parameters: only a ROS node has one"),
+        ("name: a, command: x, node_name: b", "node_name: only a ROS node has one"),
+        ("name: a, module: x, ros: true, node_name: b.c", "'b.c' cannot be the name of a ROS node"),
+        ("name: b.c, module: x, ros: true", "another name than the process, set `node_name`"),
+        (
+            "name: a, module: x, ros: true, node_name: keep, health: {lifecycle: active}",
+            "`node_name: keep` leaves it unknown",
+        ),
+        ("name: a, command: 'x $(find-pkg-share b)'", "write a list of words"),
         ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
         ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is required"),
         ("name: a, module: x, ros: true, parameters: {b: [9223372036854775808]}", "of 64 bits is"),
@@ -524,6 +548,11 @@ def test_the_allowed_keys_are_listed_once(refusal):
         ("command: x, working_directory: ../data", ("x",), "{above}/data"),
         ("command: ~/run.sh, working_directory: ~/maps", ("~/run.sh",), "~/maps"),
         ("command: /bin/true, working_directory: /tmp", ("/bin/true",), "/tmp"),
+        (
+            "command: ['$(find-pkg-prefix a)/x'], working_directory: $(find-pkg-share a)/b",
+            ("$(find-pkg-prefix a)/x",),
+            "$(find-pkg-share a)/b",
+        ),
     ],
 )
 def test_a_relative_program_or_directory_is_beside_the_file(

@@ -21,6 +21,7 @@ from rosrm.model.values import (
     Container,
     InstanceId,
     Kind,
+    ParameterSource,
     ProcessSpec,
     RestartPolicy,
     StopPolicy,
@@ -307,6 +308,101 @@ def test_parameters_go_to_a_file_beside_the_log(tmp_path):
     assert yaml.safe_load(path.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
 
 
+def test_sources_of_parameters_are_merged_in_their_order(tmp_path):
+    """Files are read on the host; sections of other nodes are left out, for an alias as well."""
+    file = tmp_path / "params.yaml"
+    file.write_text(
+        "/**: {ros__parameters: {rate: 2, tolerance: 1e-3, on: true}}\n"
+        "/robot/talker: {ros__parameters: {rate: 3}}\n"
+        "/robot/other: {ros__parameters: {rate: 4}}\n"
+    )
+    sources = (
+        ParameterSource(parameters={"rate": 1, "first": "a"}), ParameterSource(str(file)),
+        ParameterSource(nodes="/robot/*", parameters={"on": False}),
+    )  # fmt: skip
+    given = shadow()
+    spec = replace(given.spec, parameter_sources=sources)
+    launched(tmp_path, replace(given, spec=spec))
+    (made,) = (tmp_path / "logs").glob("*.yaml")
+    expected = {"rate": 3, "first": "a", "tolerance": 0.001, "on": False}
+    assert yaml.safe_load(made.read_text()) == {"/**": {"ros__parameters": expected}}
+
+
+def test_nodes_that_keep_their_names_get_no_name(tmp_path):
+    """Each section remains for the nodes of the program, and ROS applies it."""
+    made = launched(
+        tmp_path,
+        Assignment(
+            InstanceId("talker", 7),
+            ProcessSpec(
+                "talker", node_name="keep", command=("node",), ros=True,
+                parameter_sources=(ParameterSource(nodes="/a", parameters={"x": 1}),),
+            ),
+            1, "",
+        ),
+    )  # fmt: skip
+    assert made.argv[:3] == ("node", "--ros-args", "--params-file")
+    assert yaml.safe_load(Path(made.argv[3]).read_text()) == {"/a": {"ros__parameters": {"x": 1}}}
+    assert "ROSRM_NODE" not in made.environment
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (None, "No such file or directory"),
+        ("rate: 1\n", "`ros__parameters` is required below the name of a node"),
+        ("a: [\n", "expected the node content"),
+    ],
+)
+def test_a_wrong_file_of_parameters_is_refused(tmp_path, content, said):
+    """The refusal names the file and the fault; the next host is tried."""
+    path = tmp_path / "p.yaml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(LaunchError, match=said):
+        order(
+            tmp_path, command=("node",), ros=True, parameter_sources=(ParameterSource(str(path)),)
+        )
+
+
+def test_a_prefix_comes_before_the_program(tmp_path):
+    """A debugger or profiler gets the program as its arguments."""
+    made = order(tmp_path, command=("prog", "-v"), prefix=("nice", "-n", "5"), arguments=("x",))
+    assert made.argv == ("nice", "-n", "5", "prog", "-v", "x")
+
+
+def test_directories_of_packages_are_those_of_the_host(tmp_path, prefix):
+    """`$(find-pkg-share X)` may be in each text of a spec, and inside a longer one."""
+    (prefix / "share/demo_nodes").mkdir()
+    (prefix / "share/demo_nodes/p.yaml").write_text("/**: {ros__parameters: {a: 1}}")
+    share, whole = "$(find-pkg-share demo_nodes)", "$(find-pkg-prefix demo_nodes)"
+    made = order(
+        tmp_path, {"AMENT_PREFIX_PATH": str(prefix)}, command=(f"{whole}/lib/demo_nodes/talker",),
+        ros=True, arguments=(f"--a={share}/a:{share}/b",), working_directory=share,
+        parameters={"maps": [f"{share}/m"]},
+        parameter_sources=(ParameterSource(f"{share}/p.yaml"),),
+    )  # fmt: skip
+    there = f"{prefix}/share/demo_nodes"
+    assert made.argv[:2] == (f"{prefix}/lib/demo_nodes/talker", f"--a={there}/a:{there}/b")
+    assert made.working_directory == there
+    read = yaml.safe_load((tmp_path / "logs/talker.7.parameters.yaml").read_text())
+    assert read == {"/**": {"ros__parameters": {"maps": [f"{there}/m"], "a": 1}}}
+
+
+@pytest.mark.parametrize(
+    ("container", "said"),
+    [
+        (Container(), "the ROS package 'nowhere' was not found"),
+        (Container("i", "e"), "in the image"),
+    ],
+)
+def test_an_unknown_package_in_a_text_is_refused(tmp_path, container, said):
+    """In an image the packages are not known, so the path has to be written."""
+    with pytest.raises(LaunchError, match=said):
+        order(tmp_path, command=("x",), arguments=("$(find-pkg-share nowhere)/a",),
+              container=container)  # fmt: skip
+
+
 def test_no_parameters_no_file(tmp_path):
     """An empty file of parameters is an error to ROS 2."""
     made = order(tmp_path, command=("node",), ros=True, parameters={"nested": {}})
@@ -339,7 +435,7 @@ def typed(value):
 @given(PARAMETERS)
 def test_parameters_survive_with_their_types(parameters):
     """Any JSON value reads back as what it was: text stays text, 1.0 stays a fraction."""
-    read = yaml.load(parameters_text(parameters), Loader=_Loader)
+    read = yaml.load(parameters_text({"/**": parameters}), Loader=_Loader)
     assert typed(read["/**"]["ros__parameters"]) == typed(parameters)
 
 
@@ -360,12 +456,12 @@ _Loader.yaml_implicit_resolvers = {
 
 def test_whole_numbers_among_fractions_become_fractions():
     """A ROS array has one type."""
-    assert "[1.0, 2.5]" in parameters_text({"gains": [1, 2.5]})
+    assert "[1.0, 2.5]" in parameters_text({"/**": {"gains": [1, 2.5]}})
 
 
 def test_what_is_no_number_is_written_as_yaml_does():
     """NaN and the infinities are written so."""
-    text = parameters_text({"a": math.nan, "b": -math.inf})
+    text = parameters_text({"/**": {"a": math.nan, "b": -math.inf}})
     assert ".nan" in text
     assert "-.inf" in text
 
@@ -374,7 +470,7 @@ def test_what_is_no_number_is_written_as_yaml_does():
 def test_what_no_parameter_can_hold_is_refused(value):
     """The refusal names the parameter, nested ones too."""
     with pytest.raises(LaunchError, match=r"'outer\.inner'"):
-        parameters_text({"outer": {"inner": value}})
+        parameters_text({"/**": {"outer": {"inner": value}}})
 
 
 # --- environment ------------------------------------------------------------------------------

@@ -61,7 +61,7 @@ def begin_checkpoint(
     refusal = capabilities.fault(state, name, owner.host, owner.host)
     if refusal:
         return Rejected(f"{process.name} cannot be checkpointed: {refusal}")
-    node = owner.node_name or process.name
+    node = owner.node_name or process.spec.node
     move = move_of(state, process, owner.id, owner.host, owner.host, node)
     return _begin(state, process, move, name, Aim.CHECKPOINT, now, cause=cause)
 
@@ -130,7 +130,7 @@ def begin_restore(state: MasterState, process: Process, cause: str, now: float) 
             f"not fit there now: {why or 'no room'}"
         )
     source = InstanceId(process.name, image.number)
-    move = move_of(state, process, source, host, host, image.node_name or process.name)
+    move = move_of(state, process, source, host, host, image.node_name or process.spec.node)
     return _begin(
         state, process, move, image.strategy, Aim.RESTORE, now, cause=cause, ranking=ranking
     )
@@ -203,7 +203,7 @@ def commit_to_image(
     image = Image(
         migration.source.number, migration.source_host.name, migration.strategy, step.image,
         state.wall,
-        "" if migration.source_node == process.name else migration.source_node, needs,
+        "" if migration.source_node == process.spec.node else migration.source_node, needs,
     )  # fmt: skip
     process.owner = 0
     images.set_image(state, process, image)

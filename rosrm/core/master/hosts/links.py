@@ -129,7 +129,7 @@ def _process_of_node(state: MasterState) -> dict[str, str]:
     nodes = {}
     for process in state.processes.values():
         owner = state.instances.get(process.owner)
-        if owner is not None and process.spec.ros:
-            node = qualified_name(process.spec.namespace, owner.node_name or process.name)
-            nodes[node] = process.name
+        name = "" if owner is None else owner.node_name or process.spec.node
+        if name and process.spec.ros:
+            nodes[qualified_name(process.spec.namespace, name)] = process.name
     return nodes

@@ -143,7 +143,7 @@ def source_stranded(state: MasterState, event: happened.SourceStranded, now: flo
     if hosts_missing or journal_gap.why_no_work(state, now):
         return  # a destination may run that the journal does not have; the source asks again
     spec = process.spec
-    node = qualified_name(spec.namespace, source.node_name or spec.name)
+    node = qualified_name(spec.namespace, source.node_name or spec.node)
     state.record(
         now, EventKind.SOURCE_STRANDED,
         f"{source.id} is silent for a handoff to {process.name}#{event.destination}, which is not "

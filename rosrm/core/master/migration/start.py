@@ -64,7 +64,7 @@ def plan_move(
     `new_spec`: spec of the destination, if it is another version of the process.
     """
     source = state.instances[process.owner]
-    strategy, node = process.spec.migration.strategy or "", source.node_name or process.name
+    strategy, node = process.spec.migration.strategy or "", source.node_name or process.spec.node
     move = move_of(state, process, source.id, source.host, destination, node)
     return planned(state, strategy, replace(move, new_spec=new_spec), cause, now)
 
@@ -262,4 +262,4 @@ def _destination_node(plan: Plan, move: Move) -> str:
     """Return the name of the destination's node, without its namespace."""
     starts = (step for step in plan.steps if isinstance(step, Start))
     aliases = [step.node_name for step in starts if step.instance == move.destination]
-    return next(iter(aliases), "") or move.spec.name
+    return next(iter(aliases), "") or move.destination_spec.node
