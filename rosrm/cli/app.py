@@ -39,8 +39,9 @@ def _run() -> None:
 
     try:
         early.join(sys.argv[1:], os.environ)
-        from rosrm.cli.commands import app  # noqa: PLC0415 - see above
+        from rosrm.cli.commands import app, keep_only  # noqa: PLC0415 - see above
 
+        keep_only(sys.argv[1:])
         app(prog_name="rosrm")
     except SystemExit as ended:
         early.drop()

@@ -17,7 +17,6 @@ import rclpy
 from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
@@ -73,11 +72,9 @@ class Participant:
         else:
             profile = announcing(os.environ, pace, udp=True)
         with profile:
-            rclpy.init(
-                context=self.context,
-                domain_id=settings.domain,
-                signal_handler_options=SignalHandlerOptions.NO,
-            )
+            # Without the logging of ROS, which would leave an empty file for each command. Unlike
+            # `rclpy.init`, this installs no signal handlers.
+            self.context.init(domain_id=settings.domain, initialize_logging=False)
             self.node = self._lean_node(name)
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)

@@ -150,6 +150,16 @@ def test_ps(rosrm, cluster) -> None:
     assert "talker" not in rosrm.run("ps", "--host", "h1" if where == "h0" else "h0")
 
 
+def test_a_command_leaves_no_file_in_the_log_directory_of_ros(rosrm, tmp_path) -> None:
+    """ROS would make an empty one for each command."""
+    rosrm.environment["ROS_LOG_DIR"] = str(tmp_path)
+    try:
+        rosrm.run("ps")
+    finally:
+        del rosrm.environment["ROS_LOG_DIR"]
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_hosts(rosrm) -> None:
     """`rosrm hosts` shows both hosts, with usage and limits."""
     table = rosrm.run("hosts")

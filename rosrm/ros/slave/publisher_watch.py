@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import rclpy
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 
 from rosrm.ros import qos
 from rosrm.ros.polling import message_type, polled_subscription, waiting
@@ -46,7 +45,7 @@ def await_second_publisher(
     begun = time.monotonic()
     kind = _type_of(type_name)
     context = rclpy.Context()
-    rclpy.init(context=context, signal_handler_options=SignalHandlerOptions.NO)
+    context.init(initialize_logging=False)
     try:
         node = Node(
             "rosrm_watch", context=context, use_global_arguments=False, enable_rosout=False,
