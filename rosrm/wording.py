@@ -76,6 +76,11 @@ def counted(number: int, singular: str, plural: str = "") -> str:
     return f"{number or 'no'} {singular if number == 1 else plural or singular + 's'}"
 
 
+def with_article(noun: str) -> str:
+    """Return a noun with its article: "a host", "an application"."""
+    return f"{'an' if noun[:1] in 'aeiou' else 'a'} {noun}"
+
+
 def few(names: Iterable[str], most: int = 8) -> list[str]:
     """Return at most `most` names; the last item counts the others: "3 more"."""
     first = list(names)

@@ -119,7 +119,9 @@ def _application(root: Node, problems: Problems) -> tuple[str, RolloutPolicy]:
     """Return the name of the application, "" for none, and the way of its replacement."""
     app, rollout = root.get("app"), root.get("rollout")
     if app is not None and not isinstance(app.value, str):
-        problems.add(app.place, f"app: a name is required, not {described(app.plain())}")
+        problems.add(
+            app.place, f"app: a name is required, not {described(app.plain())}, such as `app: nav`"
+        )
     check_name(app, "application", problems)
     if rollout is None:
         return _text_of(app), RolloutPolicy()

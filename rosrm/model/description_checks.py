@@ -13,6 +13,7 @@ from rosrm.model.values import (
     HostDescription,
     ResourceDescription,
 )
+from rosrm.wording import with_article
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}")
 _NAMESPACE: Final = re.compile(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+")
@@ -36,8 +37,8 @@ def name_fault(name: str, what: str) -> str:
     if _NAME.fullmatch(name):
         return ""
     return (
-        f"{name!r:.250} cannot be the name of a {what}. Allowed: at most 200 letters, digits, "
-        "'_', '-' and '.', the first of them a letter, digit or '_'"
+        f"{name!r:.250} cannot be the name of {with_article(what)}. Allowed: at most 200 letters, "
+        "digits, '_', '-' and '.', the first of them a letter, digit or '_'"
     )
 
 

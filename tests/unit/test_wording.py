@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.wording import amount, counted, duration, sanitized, size, standing_for
+from rosrm.wording import (
+    amount,
+    counted,
+    duration,
+    sanitized,
+    size,
+    standing_for,
+    with_article,
+)
 
 
 @pytest.mark.parametrize(("number", "text"), [(0, "no hosts"), (1, "1 host"), (2, "2 hosts")])
@@ -70,3 +78,9 @@ def test_amounts_carry_the_unit_of_their_resource(value, unit, text):
 def test_a_text_of_any_sender_has_nothing_that_a_terminal_executes(given: str, text: str) -> None:
     """Control characters are replaced, and the length is bounded."""
     assert sanitized(given, 20 if len(given) == 30 else 100) == text
+
+
+def test_a_noun_has_its_article() -> None:
+    """Refusals of names are sentences."""
+    assert with_article("host") == "a host"
+    assert with_article("application") == "an application"

@@ -270,7 +270,7 @@ def test_the_sections_of_the_file_are_no_keys_of_a_process(refusal):
 
 
 def test_an_empty_spread_of_an_entry_for_many_means_different_hosts(file):
-    """It is the shortest form of a group without a label."""
+    """The entry is the group, and no label is named."""
     text = 'processes: [{name: "a{i}", foreach: {i: [1, 2]}, command: x, spread: {}}]'
     rules = [spec.neighbours for spec in load_work(file(text))]
     assert rules == [(NeighbourRule("apart", group="a{i}"),)] * 2

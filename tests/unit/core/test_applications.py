@@ -297,7 +297,7 @@ def test_a_finished_service_is_not_as_desired() -> None:
 
 
 def test_a_new_version_of_a_service_that_finishes_is_given_up() -> None:
-    """It ends within `healthy_for`, although without an error."""
+    """The service ends within `healthy_for`, although without an error."""
     cluster = Cluster("a")
     spec = movable("p", restart=RestartPolicy("never"))
     cluster.apply("nav", spec)

@@ -157,7 +157,7 @@ def _unknown_device(table: HostTable, demand: Demand) -> str:
 
 
 def why_no_devices(table: HostTable, needs: DeviceNeeds) -> str:
-    """Return who holds the devices that a process needs; "": nobody, or some host has free ones.
+    """Return which instances hold the devices that a process needs; "": a host has free ones.
 
     The first 16 hosts with such devices count.
     """
