@@ -142,7 +142,7 @@ def install_interfaces(steps: Steps, content: str) -> None:
     wheel = next(folder.glob("*.whl"))
     steps.run(
         "the compiled ROS interfaces",
-        *pip("install", "--force-reinstall", "--no-deps", "--no-compile", wheel),
+        *pip("install", "--force-reinstall", "--no-deps", wheel),
     )
 
 
