@@ -88,6 +88,7 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/how-to/many-hosts-discovery.md": "a server at an address of its own network",
     "docs/how-to/security.md": "a ROS 2 with DDS security, which the wheels lack",
     "docs/how-to/ubuntu-24.04-with-apt-ros.md": "apt",
+    "docs/how-to/launch-files.md": "`launch` of a ROS installation, which no package index has",
     "docs/evaluation.md": "40 minutes; tests/integration/test_paper.py runs its parts",
 }
 

@@ -17,7 +17,7 @@ _ELSEWHERE: Final = {
     for verbs, words in (
         (("cancel", "restart"), "stop"),
         (("cancel",), "kill delete del remove rm abort terminate down destroy"),
-        (("submit",), "launch add create deploy queue enqueue"),
+        (("submit",), "add create deploy queue enqueue"),
         (("submit", "restart"), "start"),
         (("restart",), "reload"),
         (("ps",), "list ls processes jobs services get"),
@@ -33,7 +33,10 @@ _ELSEWHERE: Final = {
     for word in words.split()
 }
 #: Command to the distribution that has it.
-DISTRIBUTIONS: Final = {"criu": "rosrm-criu", "lab": "rosrm-lab", "simulate": "rosrm-simulate"}
+DISTRIBUTIONS: Final = {
+    "criu": "rosrm-criu", "lab": "rosrm-lab", "launch": "rosrm-launch",
+    "simulate": "rosrm-simulate",
+}  # fmt: skip
 #: Width in which no summary of a command is cut.
 _UNCUT: Final = 1000
 #: Duplicate marks of repetition, as in "WORK......" and "[NAME...]...".

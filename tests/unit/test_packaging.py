@@ -67,7 +67,9 @@ OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJEC
 
 
 def test_every_distribution_is_looked_at() -> None:
-    parts = "checkpoint container criu examples lab migration msgs resources scoring simulate"
+    parts = (
+        "checkpoint container criu examples lab launch migration msgs resources scoring simulate"
+    )
     assert {"rosrm", *(f"rosrm-{part}" for part in parts.split())} <= OWN
 
 
@@ -94,10 +96,16 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 def test_the_readme_installs_all_that_runs() -> None:
     """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned.
 
-    The tools `rosrm-lab` and `rosrm-simulate` are optional.
+    The tools `rosrm-lab`, `rosrm-launch` and `rosrm-simulate` are optional.
     """
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
-    optional = (Path(), Path("examples"), Path("tools/lab"), Path("tools/simulate"))
+    optional = (
+        Path(),
+        Path("examples"),
+        Path("tools/lab"),
+        Path("tools/launch"),
+        Path("tools/simulate"),
+    )
     needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in optional]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])
 

@@ -73,7 +73,7 @@ def apply(  # noqa: PLR0917 - an argument for each option
         return _as_planned(client, targets, planned, plan_only=plan)
 
     names = [target.application for target in targets]
-    _carry_out(ctx, names, ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
+    carry_out(ctx, names, ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
 
 
 def _as_planned(
@@ -111,9 +111,7 @@ def revert(  # noqa: PLR0917 - an argument for each option
     def ask(client: Client) -> ApplyResult:
         return client.revert(application, to or _before(client, application), plan_only=plan)
 
-    _carry_out(
-        ctx, [application], ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json
-    )
+    carry_out(ctx, [application], ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
 
 
 def _before(client: Client, application: str) -> int:
@@ -129,7 +127,7 @@ def _before(client: Client, application: str) -> int:
     return found[-1]
 
 
-def _carry_out(
+def carry_out(
     ctx: typer.Context, names: list[str], ask: Callable[[Client], ApplyResult],
     domain: int | None, timeout: str, *, plan: bool, no_wait: bool, as_json: bool,
 ) -> None:  # fmt: skip

@@ -2,47 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
-import yaml
-
+from rosrm.config.parameter_files import parse_parameters
 from rosrm.errors import LaunchError
-from rosrm.model.parameters import merged_parameters, sections_of
+from rosrm.model.parameters import merged_parameters
 from rosrm.model.values import ParameterSource, ProcessSpec, qualified_name
-from rosrm.wording import one_line
 
 #: Most bytes of a parameters file.
 _LARGEST: Final = 1 << 24
-
-
-class _RosLoader(yaml.SafeLoader):
-    """YAML as ROS reads parameter files: `1e3` is a number, and each key is text."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Return a mapping whose keys are text, also `on` and `1`."""
-        self.flatten_mapping(node)
-        return {str(key.value): self.construct_object(item, deep) for key, item in node.value}
-
-
-_RosLoader.yaml_implicit_resolvers = {
-    first: [one for one in resolvers if one[0] != "tag:yaml.org,2002:timestamp"]
-    for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-}
-_RosLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+"), list("-+0123456789")
-)
-
-
-def parse_parameters(text: str) -> tuple[ParameterSource, ...]:
-    """Return the sections of a ROS parameters file; raises `ValueError` for another document."""
-    try:
-        document = yaml.load(text, _RosLoader)  # noqa: S506 - a SafeLoader
-    except yaml.YAMLError as error:
-        raise ValueError(one_line(str(error))) from None
-    return () if document is None else tuple(sections_of(document))
 
 
 def all_parameters(spec: ProcessSpec, node_name: str) -> dict[str, dict[str, Any]]:

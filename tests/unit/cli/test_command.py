@@ -37,7 +37,7 @@ def test_version_and_help(rosrm):
         ("kill", "Did you mean 'cancel'?"),
         ("ls", "Did you mean 'ps'?"),
         ("nodes", "Did you mean 'hosts'?"),
-        ("Launch", "Did you mean 'submit'?"),
+        ("Create", "Did you mean 'submit'?"),
         ("check", "Did you mean 'config check'?"),
     ],
 )

@@ -1,0 +1,94 @@
+"""Translated launch files on two hosts: the stored models run as applications."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from rosrm.config.work import checked_work
+from rosrm_launch.beside import completed
+from rosrm_launch.model import LaunchModel
+from rosrm_launch.translate import translated
+from tests.launch_files import make_package, stored
+from tests.ros.clusters import NODE, host
+
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """Return the prefix of the package of the launch files, with a real node in it."""
+    prefix = tmp_path_factory.mktemp("install")
+    make_package(prefix, NODE)
+    return prefix
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared, package):
+    """Return a cluster of which only the second host has the package."""
+    with pytest.MonkeyPatch.context() as patch:
+        made = make_shared(host("bare"))
+        patch.setenv("AMENT_PREFIX_PATH", str(package))
+        made.add(host("robot", labels={"has": "robot"}))
+    return made
+
+
+def target_of(name: str, beside: Path | None = None):
+    path = Path("/robot", name)
+    work = completed(translated(LaunchModel.model_validate(stored(name))), path, beside)
+    return checked_work(work, path, None)
+
+
+def said(cluster, name: str) -> dict:
+    log = cluster.wait_for_log(name, '"topic"')
+    return json.loads(next(line for line in log.splitlines() if line.startswith("{")))
+
+
+def remove(cluster, target) -> None:
+    cluster.cancel(*(spec.name for spec in target.specs))
+
+
+def test_the_nodes_of_a_launch_file_run_where_their_package_is(cluster, package, tmp_path) -> None:
+    """Names, namespaces, parameters, remappings and paths reach the nodes as from launch."""
+    beside = tmp_path / "talkers.rosrm.yaml"
+    beside.write_text("nodes: {pause: {labels: {avoided: {has: robot}}}}\n")
+    target = target_of("talkers.launch.py", beside)
+    cluster.client.apply([target])
+    rows = {spec.name: cluster.wait(spec.name, "running") for spec in target.specs}
+    assert rows.pop("pause").host == "bare"
+    assert {row.host for row in rows.values()} == {"robot"}
+    driver = said(cluster, "left.driver")
+    assert (driver["name"], driver["topic"]) == ("/left/driver", "/chatter")
+    assert driver["parameters"]["map"] == f"{package}/share/demo_robot/maps/hall.yaml"
+    assert driver["parameters"]["rate"] == 2.5
+    assert said(cluster, "right.driver")["name"] == "/right/driver"
+    assert said(cluster, "tools.monitor")["parameters"]["label"] == "included"
+    remove(cluster, target)
+
+
+def test_events_and_timers_of_a_launch_file(cluster) -> None:
+    """A node starts after the end of its spawner, another after that one; one end ends all."""
+    target = target_of("events.launch.py")
+    cluster.client.apply([target])
+    for name in ("last", "late", "follower", "shell"):
+        cluster.wait(name, "running")
+    assert cluster.process("spawner").state == "finished"
+    os.kill(cluster.process("main").pid, signal.SIGKILL)
+    ends = {spec.name: cluster.ended(spec.name).state for spec in target.specs}
+    assert (ends.pop("main"), ends.pop("spawner")) == ("failed", "finished")
+    assert set(ends.values()) == {"cancelled"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["sensors.launch.xml", "tools.launch.yaml", "lifecycle.launch.py", "components.launch.xml"],
+)
+def test_the_processes_of_each_other_file_run(cluster, name) -> None:
+    """XML, YAML, unmanaged lifecycle nodes, and containers without their components."""
+    target = target_of(name)
+    cluster.client.apply([target])
+    for spec in target.specs:
+        cluster.wait(spec.name, "running")
+    remove(cluster, target)

@@ -1,0 +1,164 @@
+"""The resolver as a process: faulty launch files, and a machine without `launch`."""
+
+from __future__ import annotations
+
+import sys
+from importlib.util import find_spec
+
+import pytest
+
+from rosrm.errors import ConfigError
+from rosrm_launch.running import launch_file, resolve
+from tests.launch_files import CASES, make_package, resolved, stored
+
+ABSENT = [
+    name for name in ("launch", "launch_ros", "composition_interfaces") if not find_spec(name)
+]
+needs_launch = pytest.mark.skipif(
+    bool(ABSENT), reason=f"{', '.join(ABSENT)} of a ROS installation cannot be imported"
+)
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Return a function that writes a launch file with a body of Python."""
+
+    def write(body, name="robot.launch.py"):
+        path = tmp_path / name
+        imports = "import os, sys, time\nfrom launch import LaunchDescription as L\n"
+        imports += "from launch.actions import *\nfrom launch_ros.actions import Node\n"
+        lines = body.replace("\n", "\n    ")
+        path.write_text(f"{imports}def generate_launch_description():\n    {lines}\n")
+        return path
+
+    return write
+
+
+def refusal(file, *arguments, timeout=30.0):
+    with pytest.raises(ConfigError) as refused:
+        resolve(file, arguments, timeout=timeout)
+    return str(refused.value)
+
+
+# --- with a real launch -----------------------------------------------------------------------
+
+
+@needs_launch
+@pytest.mark.parametrize("name", CASES)
+def test_the_stored_models_are_those_of_launch(tmp_path, name):
+    """Arguments, conditions, scopes, files and events, as this version of launch sees them."""
+    share = make_package(tmp_path / "install")
+    assert resolved(share, name, *CASES[name]) == stored(name)
+
+
+@needs_launch
+def test_nothing_is_started(file, tmp_path):
+    """Commands are only recorded, also those that an event would start."""
+    marker = tmp_path / "started"
+    model = resolve(
+        file(f"return L([ExecuteProcess(cmd=['touch', {str(marker)!r}])])"), [], timeout=30.0
+    )
+    assert model.processes[0].command == ["touch", str(marker)]
+    assert not marker.exists()
+
+
+@needs_launch
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        ("return 1 / 0", "robot.launch.py:6: ZeroDivisionError: division by zero"),
+        ("sys.exit(3)", "robot.launch.py exits with 3 instead of describing a launch"),
+        ("os._exit(4)", "the resolver ended with exit code 4 and without a result"),
+        ("return 5", "robot.launch.py"),
+        (
+            "return L([DeclareLaunchArgument('map', description='Map')])",
+            "required: map (Map); write map:=VALUE",
+        ),
+    ],
+)
+def test_a_faulty_launch_file_is_one_error(file, body, said):
+    """The error names the file, its line where there is one, and the cause."""
+    assert said in refusal(file(body))
+
+
+@needs_launch
+def test_an_unknown_argument_is_refused(file):
+    """With the nearest one, and all others."""
+    path = file("return L([DeclareLaunchArgument('speed', default_value='1')])")
+    said = refusal(path, "sped:=2")
+    assert "declares no argument sped; did you mean speed? Its arguments: speed" in said
+
+
+@needs_launch
+def test_a_file_that_never_ends_is_ended(file):
+    """With all that it has started."""
+    assert "not resolved within 3 s" in refusal(file("time.sleep(1000)"), timeout=3.0)
+
+
+@needs_launch
+def test_a_thread_of_the_file_does_not_keep_the_resolver(file):
+    """Neither one of its own, nor that of a ROS node of launch."""
+    body = "import threading\nthreading.Thread(target=time.sleep, args=(1000,)).start()\n"
+    body += "from launch_ros.actions import SetUseSimTime\n"
+    body += "return L([SetUseSimTime(True), Node(package='p', executable='e', name='n')])"
+    (process,) = resolve(file(body), [], timeout=30.0).processes
+    assert (process.name, process.parameters) == ("n", [])
+
+
+@needs_launch
+def test_the_environment_of_a_process_is_what_the_file_changes(file):
+    """Variables are added; what cannot be done is listed."""
+    body = "return L([SetEnvironmentVariable('A', '1'), UnsetEnvironmentVariable('HOME'),\n"
+    body += "  ExecuteProcess(cmd=['x'], additional_env={'B': '2'}),\n"
+    body += "  ExecuteProcess(cmd=['y'], env={'C': '3'})])"
+    model = resolve(file(body), [], timeout=30.0)
+    assert [one.environment for one in model.processes] == [{"A": "1", "B": "2"}, {"C": "3"}]
+    assert [str(one).partition(": ")[2] for one in model.omissions] == [
+        "environment of x: HOME cannot be removed",
+        "environment of y: `env` replaces all variables; its own are added instead",
+    ]
+
+
+@needs_launch
+def test_output_of_the_file_is_not_the_result(file):
+    """A launch file may print, also JSON."""
+    path = file("print('{}')\nos.write(1, b'{}')\nreturn L([Node(package='p', executable='e')])")
+    (process,) = resolve(path, [], timeout=30.0).processes
+    assert process.executable == "e"
+
+
+# --- without one ------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not ABSENT, reason="launch can be imported here")
+def test_without_launch_the_error_says_where_it_comes_from(file):
+    """The path of the interpreter shows which environment lacks it."""
+    said = refusal(file("return L([])"))
+    assert f"{sys.executable} cannot import `launch` and `launch_ros`" in said
+    assert "/opt/ros/jazzy/setup.bash" in said
+
+
+def test_a_launch_file_is_found_in_its_package(tmp_path, monkeypatch):
+    """In any folder of its share directory, as `ros2 launch` does."""
+    share = make_package(tmp_path)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    assert launch_file(["demo_robot", "events.launch.py"]) == share / "launch/events.launch.py"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "give a launch file, or a package"),
+        (["a", "b", "c"], "give a launch file, or a package"),
+        (["no.launch.py"], "no.launch.py: no such launch file; give PACKAGE FILE"),
+        (["nowhere", "x"], "the ROS package 'nowhere' was not found"),
+        (["demo_robot", "event.launch.py"], "did you mean 'events.launch.py'?"),
+    ],
+)
+def test_a_launch_file_that_is_not_there(tmp_path, monkeypatch, words, said):
+    make_package(tmp_path)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as refused:
+        launch_file(words)
+    assert said in str(refused.value)

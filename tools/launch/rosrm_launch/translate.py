@@ -1,0 +1,282 @@
+"""Translation of a resolved launch file into a work file with an application; pure functions."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import PurePath
+from typing import Any, Final
+
+from rosrm.errors import ConfigError
+from rosrm.model.description_checks import is_node_name
+from rosrm.model.parameters import SECTION, merged_parameters
+from rosrm.model.values import KEEP_NAME, ParameterSource, qualified_name
+from rosrm.wording import listed
+from rosrm_launch.model import LaunchModel, Omission, Process
+
+#: Restarts of a process that launch starts again without end.
+_ENDLESS: Final = 2**31 - 1
+#: Most processes that one start order names.
+_MOST_AWAITED: Final = 256
+_NOT_YET: Final = "cannot be translated yet"
+#: Characters that no name of a process has.
+_FOREIGN: Final = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+@dataclass
+class Translation:
+    """A launch file as an application.
+
+    Attributes:
+        work: contents of a work file.
+        nodes: name of each process to the full name of its node; "": not known, or none.
+        omissions: actions without a counterpart.
+        notes: facts that a user should know.
+    """
+
+    work: dict[str, Any]
+    nodes: dict[str, str]
+    omissions: list[Omission] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def translated(model: LaunchModel, application: str = "") -> Translation:
+    """Return the application of a launch file; its name is by default that of the file.
+
+    Raises:
+        ConfigError: the file starts nothing, or two containers have one name.
+    """
+    return _Translator(model, application or name_of(PurePath(model.file).name.split(".")[0])).run()
+
+
+def name_of(text: str) -> str:
+    """Return a text as the name of a process or application."""
+    return _FOREIGN.sub("_", text).strip("._-")[:180] or "process"
+
+
+class _Translator:
+    def __init__(self, model: LaunchModel, application: str) -> None:
+        self._model = model
+        self._application = application
+        self._paths = _Packages(model.packages)
+        self._omissions = list(model.omissions)
+        self._notes = list(model.notes)
+        self._started = self._without_endless_waits(model.processes)
+        self._names = dict(zip((one.number for one in self._started), self._chosen(), strict=True))
+        self._jobs = {
+            wait.process for one in self._started for wait in one.waits if wait.event == "exited"
+        }
+
+    def run(self) -> Translation:
+        self._note_parts()
+        if not self._started:
+            raise ConfigError(f"{self._model.file}: the launch file starts no process")
+        work: dict[str, Any] = {"app": self._application}
+        ends = [self._names[one.number] for one in self._started if one.ends_all]
+        if ends:
+            work["group"] = {"name": self._application, "ends_with": ends}
+        work["processes"] = [self._entry(one) for one in self._started]
+        nodes = {self._names[one.number]: _node_of(one) for one in self._started}
+        twice = [node for node, count in Counter(filter(None, nodes.values())).items() if count > 1]
+        self._notes += [f"several processes have a node {node}" for node in twice]
+        return Translation(work, nodes, self._omissions, self._notes)
+
+    # --- which processes, under which names ---------------------------------------------------
+
+    def _without_endless_waits(self, processes: Sequence[Process]) -> list[Process]:
+        """Leave out processes that would start each time when another one ends."""
+        endless = {one.number for one in processes if one.respawn}
+        kept = []
+        for one in processes:
+            if any(wait.event == "exited" and wait.process in endless for wait in one.waits):
+                endless.add(one.number)  # what waits for it never starts, either
+                self._omit(one, _title(one), "it starts at each end of a process that respawns")
+            else:
+                kept.append(one)
+        return kept
+
+    def _chosen(self) -> Iterator[str]:
+        """Yield a unique name for each process: that of its node, or of its program."""
+        used: set[str] = set()
+        for one in self._started:
+            stem = name = name_of(_node_of(one).strip("/").replace("/", ".") or _program_of(one))
+            number = 2
+            while name in used:
+                name, number = f"{stem}-{number}", number + 1
+            used.add(name)
+            yield name
+
+    def _note_parts(self) -> None:
+        """List components and transitions, and refuse containers that cannot be told apart."""
+        model = self._model
+        containers = [one for one in model.processes if one.kind == "container"]
+        for node, count in Counter(map(_node_of, containers)).items():
+            if count > 1:
+                files = listed(sorted({one.file for one in containers if _node_of(one) == node}))
+                raise ConfigError(f"{files}: {count} containers have the name {node}; rename one")
+        for one in containers:
+            if one.components:
+                plugins = listed([part.plugin for part in one.components])
+                self._omit(one, f"container {_node_of(one)}", f"loading {plugins} {_NOT_YET}")
+        for load in model.loads:
+            plugins = listed([part.plugin for part in load.components])
+            self._omit(load, f"LoadComposableNodes into {load.container}", f"{plugins}: {_NOT_YET}")
+        for change in model.transitions:
+            nodes = listed(change.nodes) or "no node"
+            self._omit(change, f"transition {change.transition} of {nodes}", _NOT_YET)
+
+    def _omit(self, at: Any, action: str, reason: str) -> None:
+        self._omissions.append(Omission(file=at.file, action=action, reason=reason))
+
+    # --- one process --------------------------------------------------------------------------
+
+    def _entry(self, one: Process) -> dict[str, Any]:
+        """Return the entry of a process in a work file, without what is as by default."""
+        entry: dict[str, Any] = {"name": self._names[one.number]}
+        if one.kind != "command":
+            node = one.name or KEEP_NAME
+            entry |= {"node_name": node} if node != entry["name"] else {}
+            entry |= {"namespace": one.namespace} if one.namespace else {}
+        if one.package:
+            entry |= {"package": one.package, "executable": one.executable}
+        else:
+            words = ["sh", "-c", *one.command] if one.shell else one.command
+            entry["command"] = self._paths.in_texts(words)
+            entry |= {"ros": True} if one.kind != "command" else {}
+        others = {
+            "prefix": self._paths.in_texts(one.prefix),
+            "arguments": self._paths.in_texts(one.arguments),
+            "parameters": self._parameters(one),
+            "remappings": _remappings(one.remappings),
+            "environment": self._paths.in_texts(one.environment),
+            "working_directory": self._paths.in_texts(one.working_directory),
+            "kind": "job" if one.number in self._jobs else "",
+            "restart": _restart(one),
+            "stop": _stop(one),
+            "after": self._after(one),
+        }
+        entry |= {key: value for key, value in others.items() if value}
+        self._note_paths(one)
+        return entry
+
+    def _parameters(self, one: Process) -> Any:
+        """Return the parameters that apply to the node; all sections if its name is not known."""
+        sources = [
+            ParameterSource(nodes=given.nodes, parameters=self._values(one, given.values))
+            for given in one.parameters
+        ]
+        # As launch_ros says: those of a full name override those of a pattern, in any order.
+        sources.sort(key=lambda source: "*" not in source.nodes)
+        merged = merged_parameters(sources, _node_of(one))
+        if one.name:
+            return next(iter(merged.values()), {})
+        return [{nodes: {SECTION: values}} for nodes, values in merged.items()]
+
+    def _values(self, one: Process, values: Mapping[str, Any]) -> dict[str, Any]:
+        empty = [name for name, value in values.items() if value is None or value == []]
+        if empty:
+            self._notes.append(f"{one.file}: {_title(one)}: no value of {listed(empty)} is given")
+        return {
+            name: self._paths.in_texts(value) for name, value in values.items() if name not in empty
+        }
+
+    def _after(self, one: Process) -> dict[str, Any]:
+        after = {
+            self._names[wait.process]: "finished" if wait.event == "exited" else "ready"
+            for wait in one.waits
+        }
+        if not one.delay:
+            return after
+        if not after:
+            after = {
+                self._names[other.number]: "ready" for other in self._started
+                if not (other.delay or other.waits or other.number in self._jobs)
+            }  # fmt: skip
+            if not after or len(after) > _MOST_AWAITED:
+                self._omit(one, f"timer of {_title(one)}", "no process begins before it")
+                return {}
+            self._notes.append(
+                f"{one.file}: {_title(one)} starts {one.delay:g} s after all processes without a "
+                "timer are ready"
+            )
+        return {**after, "delay": one.delay}
+
+    def _note_paths(self, one: Process) -> None:
+        outside = [path for path in one.paths if not self._paths.has(path)]
+        if outside:
+            self._notes.append(
+                f"{one.file}: {_title(one)} names {listed(outside)}, which must exist on each host "
+                "that may run it"
+            )
+
+
+class _Packages:
+    """Paths below the directories of packages, written so that each host finds them."""
+
+    def __init__(self, prefixes: Mapping[str, str]) -> None:
+        self._prefixes = prefixes
+        roots = "|".join(sorted(map(re.escape, set(prefixes.values())), key=len, reverse=True))
+        self._path = re.compile(rf"({roots})/(share|lib)/([A-Za-z0-9_]+)(?![\w.-])")
+
+    def in_texts(self, value: Any) -> Any:
+        """Return a value whose texts name packages instead of their directories here."""
+        if isinstance(value, str):
+            return self._path.sub(self._reference, value) if self._prefixes else value
+        if isinstance(value, list):
+            return [self.in_texts(one) for one in value]
+        if isinstance(value, Mapping):
+            return {key: self.in_texts(one) for key, one in value.items()}
+        return value
+
+    def has(self, path: str) -> bool:
+        """Return True for a path below the directory of a package."""
+        return bool(self.in_texts(path) != path)
+
+    def _reference(self, found: re.Match[str]) -> str:
+        prefix, folder, package = found.groups()
+        if self._prefixes.get(package) != prefix:
+            return found[0]
+        if folder == "share":
+            return f"$(find-pkg-share {package})"
+        return f"$(find-pkg-prefix {package})/lib/{package}"
+
+
+def _node_of(one: Process) -> str:
+    """Return the full name of the node of a process; "": it has none, or it is not known."""
+    return qualified_name(one.namespace, one.name) if one.name and is_node_name(one.name) else ""
+
+
+def _program_of(one: Process) -> str:
+    if one.executable or one.label:
+        return one.label or one.executable
+    words = one.command[0].split() if one.shell and one.command else one.command
+    return PurePath(words[0]).name if words else "process"
+
+
+def _title(one: Process) -> str:
+    return _node_of(one) or (f"{one.package}/{one.executable}" if one.package else _program_of(one))
+
+
+def _remappings(rules: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Return rules by source; of several for one source, ROS applies the first."""
+    found: dict[str, str] = {}
+    for source, target in rules:
+        found.setdefault(source, target)
+    return found
+
+
+def _restart(one: Process) -> Any:
+    if not one.respawn:
+        return "never"
+    attempts = one.respawn_retries if one.respawn_retries >= 0 else _ENDLESS
+    return {
+        "when": "always", "delay": one.respawn_delay, "max_delay": one.respawn_delay, "factor": 1.0,
+        "attempts": attempts,
+    }  # fmt: skip
+
+
+def _stop(one: Process) -> dict[str, float]:
+    stop = {"interrupt_grace": one.interrupt_grace, "terminate_grace": one.terminate_grace}
+    return stop if set(stop.values()) != {5.0} else {}
