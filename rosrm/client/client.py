@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -13,7 +12,6 @@ from rosrm.client.connecting import connect, ros_settings, row_of, security_mode
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.errors import Refused
 from rosrm.model.applications import Target
-from rosrm.model.codec import to_plain
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import ProcessSpec
 
@@ -124,7 +122,7 @@ class Client:
     def apply_targets(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
         """Make applications as their targets describe them, all or none; see `apply`."""
         sent = [self._sent_target(one) for one in targets]
-        return replace(self._master.apply(sent, plan_only=plan_only), work=_digest_of(sent))
+        return self._master.apply(sent, plan_only=plan_only)
 
     def _sent_target(self, target: Target) -> Target:
         return replace(target, specs=tuple(self._sent(target.specs)))
@@ -489,13 +487,6 @@ class Client:
     def __exit__(self, *_: object) -> None:
         """Close the client."""
         self.close()
-
-
-def _digest_of(targets: Iterable[Target]) -> str:
-    from hashlib import sha256  # noqa: PLC0415 - for those who apply
-
-    text = json.dumps([to_plain(one) for one in targets], sort_keys=True)
-    return sha256(text.encode("utf-8", "surrogatepass")).hexdigest()[:32]
 
 
 def _ignore(_row: object) -> None:

@@ -225,11 +225,18 @@ def _parameters(message: msg.ProcessSpec | msg.ParameterSource) -> dict[str, Any
     }
 
 
-def target_to_msg(target: Target) -> msg.ApplicationTarget:
-    """Return the desired state of an application as a message."""
+def target_to_msg(
+    target: Target, digest: str = "", *, with_specs: bool = True
+) -> msg.ApplicationTarget:
+    """Return the desired state of an application as a message.
+
+    Args:
+        digest: of its specs; "": unknown.
+        with_specs: False: only the digest is sent.
+    """
     return msg.ApplicationTarget(
-        application=target.application, version=target.version,
-        processes=[spec_to_msg(spec) for spec in target.specs],
+        application=target.application, version=target.version, digest=digest,
+        processes=[spec_to_msg(spec) for spec in target.specs] if with_specs else [],
         max_parallel=target.rollout.max_parallel,
         healthy_for=float(target.rollout.healthy_for), on_failure=target.rollout.on_failure,
     )  # fmt: skip

@@ -8,7 +8,7 @@ import os
 import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm.errors import NoMaster, Refused
@@ -29,6 +29,7 @@ from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.ros.introductions import introduction_of, introduction_request
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
+from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import srv
 
@@ -279,11 +280,23 @@ class MasterClient:
 
     def apply(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
         """Make applications as desired, or return the plan of that."""
-        answer = self._request(
-            srv.Apply, names.APPLY, targets=[convert.target_to_msg(one) for one in targets],
-            plan_only=plan_only,
-        )  # fmt: skip
-        return _apply_result(answer)
+        digests = [digest_of(one.specs) if one.specs else "" for one in targets]
+        headings = [replace(one, specs=()) for one in targets]
+
+        def ask(*, with_specs: bool) -> ApplyResult:
+            messages = [
+                convert.target_to_msg(one, digest, with_specs=with_specs)
+                for one, digest in zip(targets, digests, strict=True)
+            ]
+            answer = self._request(srv.Apply, names.APPLY, targets=messages, plan_only=plan_only)
+            return replace(_apply_result(answer), work=digest_of([headings, digests]))
+
+        try:
+            return ask(with_specs=False)
+        except Refused as refusal:
+            if refusal.code != UNKNOWN_DIGEST:
+                raise
+        return ask(with_specs=True)
 
     def load_modes(self, modes: Sequence[Mode]) -> str:
         """Replace the modes of the cluster, all or none; return the master's message."""

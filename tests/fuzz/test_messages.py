@@ -19,6 +19,7 @@ from rosrm.keys.security import NoSecurity
 from rosrm.model.codec import to_plain
 from rosrm.ros import convert
 from rosrm.ros.master import services
+from rosrm.ros.master.known_specs import KnownSpecs
 from rosrm.ros.orders import order_from_msg
 from rosrm_msgs import msg, srv
 from tests.fuzz.hostile import floats, fuzzed, json_values, texts
@@ -36,6 +37,7 @@ class Requests(services.MasterServices):
 
     def __init__(self) -> None:
         self._queries = SimpleNamespace(has_artifact=lambda digest, size: True)
+        self._known = KnownSpecs()
 
 
 MASTER = Requests()

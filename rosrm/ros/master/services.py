@@ -29,6 +29,7 @@ from rosrm.ros.control import (
     version_refusal,
 )
 from rosrm.ros.introductions import ticket_version
+from rosrm.ros.master.known_specs import KnownSpecs
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
@@ -110,6 +111,7 @@ class MasterServices:
         self._handle = handle
         self._refuse = refuse
         self._strangers = strangers
+        self._known = KnownSpecs()
         self._open: dict[int, Callable[[Reply], None]] = {}
         self._next_request = 1
         self._offer(names.Names(endpoints.participant.settings.namespace))
@@ -190,8 +192,10 @@ class MasterServices:
         return happened.SubmissionReceived(token, specs, _requester(peer))
 
     def _applied(self, request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:
-        targets = self._targets(request.targets)
         by = _requester(peer)
+        targets = tuple(
+            convert.target_from_msg(one, self._specs_of(one, by)) for one in request.targets
+        )
         return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
 
     def _modes_loaded(
@@ -202,12 +206,22 @@ class MasterServices:
         )
         return happened.ModesLoaded(token, modes, _requester(peer))
 
+    def _specs_of(self, target: Any, by: Requester) -> tuple[ProcessSpec, ...]:
+        """Return the specs of a target of a request; it may name known ones by their digest."""
+        if target.digest and not target.processes:
+            return self._checked(self._known.find(by.name, target.digest))
+        specs = tuple(convert.spec_from_msg(message) for message in target.processes)
+        self._known.keep(by.name, target.digest, specs)
+        return self._checked(specs)
+
     def _targets(self, messages: Iterable[Any]) -> tuple[Target, ...]:
         return tuple(convert.target_from_msg(one, self._specs(one.processes)) for one in messages)
 
     def _specs(self, messages: Iterable[Any]) -> tuple[ProcessSpec, ...]:
+        return self._checked(tuple(convert.spec_from_msg(message) for message in messages))
+
+    def _checked(self, specs: tuple[ProcessSpec, ...]) -> tuple[ProcessSpec, ...]:
         """Return the specs of a request, whose artifacts are stored; raises `Refused`."""
-        specs = tuple(convert.spec_from_msg(message) for message in messages)
         for spec in specs:
             for one in spec.artifacts:
                 if not self._queries.has_artifact(one.digest, one.size):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 
 from rosrm.model.applications import Action, ApplicationRow, ApplyResult, PlannedAction
+from rosrm.ros.spec_digests import digest_of
 
 from .conftest import process
 
@@ -32,7 +33,7 @@ def master(client):
         client.asked.append(
             ("plan" if plan_only else "apply", [one.application for one in targets])
         )
-        return ApplyResult("nav version 1", client.actions)
+        return ApplyResult("nav version 1", client.actions, digest_of(targets))
 
     client.apply = apply
     return client
