@@ -2,7 +2,7 @@
 
 Each simulated slave is a real `SlaveEndpoint` (handshake, registration, readings, requests for
 work, statuses) over a real slave's core. Its readings come from a random walk instead of probes,
-and each instance is reported as running and then as ended, without a process.
+and each instance is reported as running, and then as ended if it is of a job, without a process.
 
 All slaves of a process share one DDS participant, one node, and the entities that are seldom used:
 the clients for handshake, registration and leaving, the publishers of statuses and usages, and the
@@ -50,10 +50,11 @@ from rosrm.keys.security import Member
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import (
     RESOURCE_SLOTS,
+    Assignment,
     HostDescription,
-    InstanceId,
     InstanceState,
     InstanceStatus,
+    Kind,
     ResourceDescription,
 )
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
@@ -143,21 +144,23 @@ class SimulatedSlave:
         self.work(now)
 
     def work(self, now: float) -> None:
-        """Process the queued events; report each launched process as running, then as ended."""
+        """Process the queued events; report launched processes as running, jobs also as ended."""
         while self._events:
             events, self._events = self._events, []
             for command in reducer.step_all(self._state, events, now):
                 if isinstance(command, commands.Report):
                     self.endpoint.publish_statuses(command.statuses, complete=command.complete)
                 elif isinstance(command, commands.Launch):
-                    self._run([one.instance for one in command.assignments])
+                    self._run(command.assignments)
         self.endpoint.ask(now)
 
-    def _run(self, instances: Sequence[InstanceId]) -> None:
-        for instance in instances:
-            self._tally.taken[instance.process] = time.time()
-            for state in (InstanceState.RUNNING, InstanceState.EXITED):
-                status = InstanceStatus(instance, state, pid=os.getpid())
+    def _run(self, assignments: Sequence[Assignment]) -> None:
+        for one in assignments:
+            self._tally.taken[one.instance.process] = time.time()
+            is_job = one.spec.kind is Kind.JOB
+            last = InstanceState.EXITED if is_job else InstanceState.READY
+            for state in (InstanceState.RUNNING, last):
+                status = InstanceStatus(one.instance, state, pid=os.getpid())
                 self._events.append(SupervisorReported((status,)))
 
     def take(self, event: Event) -> None:
