@@ -94,7 +94,7 @@ def test_processes_start_in_their_order_and_stop_in_the_reverse_one(cluster: Clu
     cancel(cluster, "ordered")
     sequence = {(one.process, one.kind): one.sequence for one in cluster.events()}
     assert sequence["calibrate", "finished"] < sequence["camera", "assigned"]
-    assert sequence["camera", "ready"] < sequence["viewer", "assigned"]
+    assert sequence["camera", "assigned"] < sequence["viewer", "assigned"]
     assert sequence["viewer", "cancelled"] < sequence["camera", "cancelled"]
 
 

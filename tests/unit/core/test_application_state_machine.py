@@ -273,4 +273,4 @@ class Applications(RuleBasedStateMachine):
 
 TestApplications = Applications.TestCase
 if os.environ.get("ROSRM_PLAY") != "long":  # each step is some seconds of the play
-    TestApplications.settings = settings(max_examples=25, stateful_step_count=20)
+    TestApplications.settings = settings(max_examples=15, stateful_step_count=20)
