@@ -33,7 +33,7 @@ def started(terminal: Terminal, *words: str) -> Iterator[tuple[subprocess.Popen,
     with terminal.start("up", "--hosts", "2", *words, work, start_new_session=True) as process:
         try:
             said = ""
-            for ready in ("sleeper_1 is ready", "sleeper_2 is ready"):
+            for ready in ("sleeper_1 is running", "sleeper_2 is running"):
                 if ready not in said:
                     said += read_until(process.stdout.fileno(), ready)
                 assert ready in said, said + process.stderr.read()

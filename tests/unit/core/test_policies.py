@@ -82,7 +82,7 @@ BROKEN = [
         "'name' of the spec, which its offer does not declare: add reads=('name',) to the offer",
     ),
     (reads("name", ""), "UndeclaredField"),
-    (reads("nmae"), "AttributeError: a spec has no field 'nmae'; it has name, namespace"),
+    (reads("nmae"), "AttributeError: a spec has no field 'nmae'; it has name, node_name"),
     (writes, "read-only"),
 ]
 

@@ -137,7 +137,7 @@ def test_what_lacks_its_method_is_refused_when_it_is_made(made, said):
 @pytest.mark.parametrize(
     ("reads", "said"),
     [
-        (("nmae",), "`reads` has no field 'nmae'; did you mean 'name'? Allowed: name, namespace"),
+        (("nmae",), "`reads` has no field 'nmae'; did you mean 'name'? Allowed: name, node_name"),
         ("name", "`reads` is 'name'; a tuple of field names is required"),
         (None, "`reads` is None; a tuple"),
     ],

@@ -16,6 +16,7 @@ from tests.unit.core.cluster import Cluster, process
 
 REFUSED = {
     happened.HostRegistered, happened.SubmissionReceived, happened.ApplicationsRequested,
+    happened.ModesLoaded, happened.ModeRequested,
     happened.CancelRequested,
     happened.RestartRequested, happened.MigrationRequested, happened.HostStateRequested,
     happened.CheckpointRequested, happened.RestoreRequested, happened.PruneRequested,
