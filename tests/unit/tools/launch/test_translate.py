@@ -14,6 +14,8 @@ from rosrm_launch.model import LaunchModel, Parameters, Process, Wait
 from rosrm_launch.translate import translated
 from tests.launch_files import CASES, stored
 
+ROOT = Path(__file__).resolve().parents[4]
+
 
 def translation_of(name):
     return translated(LaunchModel.model_validate(stored(name)))
@@ -186,7 +188,7 @@ def beside(tmp_path):
 
 def test_the_settings_of_the_documentation_are_valid(tmp_path):
     """Those of the page on launch files."""
-    page = Path("docs/how-to/launch-files.md").read_text()
+    page = (ROOT / "docs/how-to/launch-files.md").read_text(encoding="utf-8")
     (tmp_path / "robot.rosrm.yaml").write_text(page.partition("```yaml\n")[2].partition("```")[0])
     nodes = [node(0, "camera", namespace="/front"), node(1, "planner"), node(2, "map_server")]
     translation = made(*nodes, node(3, "detector"))
