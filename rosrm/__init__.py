@@ -26,6 +26,8 @@ Client          Client, load_work, RosSettings; its results: Listing, ProcessRow
 Processes       ProcessSpec, Kind, RestartPolicy, Readiness, StopPolicy, MigrationPolicy,
                 HostLossPolicy, IsolationPolicy, StandbyPolicy, Health, NeighbourRule, DeviceNeed,
                 Artifact, ReschedulePolicy, StartOrder, GroupMembership, ArrayMembership, Schedule
+Applications    Target, RolloutPolicy; results: ApplyResult, PlannedAction, Action, ApplicationRow,
+                VersionRow, ModeRow
 Plugins         hookimpl, NoOptions, SkipPlugin
   probes        ProbeOffer, Probe, ProcessMeasuring, DeviceFinding, HostLabelling, ProbeContext,
                 Sessions, ResourceDescription, Accounting, Reading, Device
@@ -122,9 +124,19 @@ if TYPE_CHECKING:
         ResourceName,
         Seconds,
     )
+    from rosrm.model.applications import (
+        Action,
+        ApplicationRow,
+        ApplyResult,
+        PlannedAction,
+        RolloutPolicy,
+        Target,
+        VersionRow,
+    )
     from rosrm.model.arrays import ArrayMembership
     from rosrm.model.artifacts import Artifact
     from rosrm.model.devices import Device, DeviceNeed
+    from rosrm.model.modes import ModeRow
     from rosrm.model.plan import (
         AwaitReady,
         AwaitReleased,
@@ -174,26 +186,25 @@ if TYPE_CHECKING:
 
 # Spelt out for tools that read this file without running it. A test compares the three lists.
 __all__ = [
-    "PROTOCOL_VERSION", "Accounting", "Amount", "ArrayMembership", "Artifact", "AwaitReady",
-    "AwaitReleased", "BoolArray", "Bytes",
-    "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy",
-    "CheckpointView", "Client", "Commit", "ConfigError", "Configure", "Count",
-    "Device", "DeviceFinding", "DeviceNeed", "DeviceRow",
-    "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView", "Fraction",
-    "GraphDepartureLauncher", "GroupMembership", "HandoffPhase", "Health", "HostChecking",
-    "HostDescription",
-    "HostLabelling", "HostLossPolicy",
-    "HostRow", "HostView", "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy",
-    "Kind", "Launch", "Launcher", "LauncherContext", "LauncherOffer", "LinkView", "Listing",
-    "LogChunk", "MemoryPacing", "MemoryView", "MigrationOffer", "MigrationPolicy",
-    "MigrationStrategy", "Move", "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging",
-    "PlacementFilter", "Plan", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds",
-    "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
+    "PROTOCOL_VERSION", "Accounting", "Action", "Amount", "ApplicationRow", "ApplyResult",
+    "ArrayMembership", "Artifact", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
+    "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy", "CheckpointView",
+    "Client", "Commit", "ConfigError", "Configure", "Count", "Device", "DeviceFinding",
+    "DeviceNeed", "DeviceRow", "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView",
+    "Fraction", "GraphDepartureLauncher", "GroupMembership", "HandoffPhase", "Health",
+    "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy", "HostRow", "HostView",
+    "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "Launch", "Launcher",
+    "LauncherContext", "LauncherOffer", "LinkView", "Listing", "LogChunk", "MemoryPacing",
+    "MemoryView", "MigrationOffer", "MigrationPolicy", "MigrationStrategy", "ModeRow", "Move",
+    "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging", "PlacementFilter", "Plan",
+    "PlannedAction", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
+    "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
-    "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RosSettings",
-    "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy", "Seconds", "Sessions",
-    "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start", "StartOrder", "Step",
-    "Stop", "StopPolicy", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
+    "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RolloutPolicy",
+    "RosSettings", "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy",
+    "Seconds", "Sessions", "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start",
+    "StartOrder", "Step", "Stop", "StopPolicy", "Target", "VersionRow", "WaitResult",
+    "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -217,9 +228,13 @@ _NAMES: Final = {
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
+    "model.applications": (
+        "Action ApplicationRow ApplyResult PlannedAction RolloutPolicy Target VersionRow"
+    ),
     "model.arrays": "ArrayMembership",
     "model.artifacts": "Artifact",
     "model.devices": "Device DeviceNeed",
+    "model.modes": "ModeRow",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
         "SetRestart Start Step Stop"

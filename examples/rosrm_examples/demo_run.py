@@ -11,8 +11,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final, Protocol
 
-from rosrm import Client, InstanceId, Listing, ProcessRow, RosrmError
-from rosrm.model.applications import Target
+from rosrm import Client, InstanceId, Listing, ProcessRow, RosrmError, Target
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival

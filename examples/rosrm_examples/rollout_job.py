@@ -10,9 +10,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessSpec, RestartPolicy
+from rosrm import (
+    Client,
+    Kind,
+    Listing,
+    MigrationPolicy,
+    ProcessSpec,
+    RestartPolicy,
+    RolloutPolicy,
+    Target,
+)
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings
-from rosrm.model.applications import RolloutPolicy, Target
 from rosrm_examples.demo_job import NODE_STOP
 from rosrm_examples.demo_progress import Progress
 from rosrm_examples.demo_record import ENDED

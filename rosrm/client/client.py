@@ -111,7 +111,8 @@ class Client:
             plan_only: True: return the actions that would follow, and begin none.
 
         Raises:
-            ConfigError: a file is invalid, or has no application; nothing was sent.
+            ConfigError: a file is invalid or has no application, or an artifact cannot be read;
+                nothing was changed.
         """
         from rosrm.config.work import load_application  # noqa: PLC0415 - imports pydantic
 
@@ -120,7 +121,15 @@ class Client:
         return self.apply_targets(targets, plan_only=plan_only)
 
     def apply_targets(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
-        """Make applications as their targets describe them, all or none; see `apply`."""
+        """Make applications as their targets describe them, all or none.
+
+        Args:
+            targets: a desired state for each application.
+            plan_only: True: return the actions that would follow, and begin none.
+
+        Raises:
+            ConfigError: an artifact cannot be read; nothing was changed.
+        """
         sent = [self._sent_target(one) for one in targets]
         return self._master.apply(sent, plan_only=plan_only)
 

@@ -19,9 +19,11 @@ class RolloutPolicy:
     """Way in which changed processes are replaced.
 
     Attributes:
-        max_parallel: highest number of running processes that are being replaced at the same time.
+        max_parallel: highest number of running processes that are replaced at the same time, from
+            1.
         healthy_for: seconds for which a new instance must run without a restart.
-        on_failure: treatment of a replacement that fails.
+        on_failure: treatment of a replacement that fails: "return" to the former version, or
+            "pause" with the processes that are not replaced yet as they are.
     """
 
     max_parallel: int = 1
@@ -35,9 +37,10 @@ class Target:
 
     Attributes:
         application: its name.
-        specs: all its processes; (): none are given.
+        specs: all its processes, whose `application` is this name; (): none are given.
         version: number of an earlier version; 0: that of `specs` or, without any, no version: the
             application is cancelled.
+        rollout: way in which changed processes are replaced.
     """
 
     application: str
@@ -47,7 +50,11 @@ class Target:
 
 
 class Action(str, Enum):
-    """Action on a process by which it gets as its application wants it."""
+    """Action on a process by which it gets as its application wants it.
+
+    `CHANGE` applies to the running instance, `REPLACE` starts a new instance with the new spec, and
+    `MOVE` runs the same spec on another host.
+    """
 
     START = "start"
     STOP = "stop"
@@ -62,10 +69,12 @@ class PlannedAction:
 
     Attributes:
         process: name of the process.
+        action: action on the process.
+        application: name of its application; "": it belongs to none.
         host: name of the host on which it will run; "": it waits, or is stopped.
         before: name of the host on which it runs now; "": it does not run.
         reason: cause of the action.
-        fields: changed fields of the spec.
+        fields: names of the changed fields of the spec.
         waits: why it will wait after the action; "": it will not.
         decision: placement decision, as in the event record; None: nothing is placed.
     """
@@ -106,8 +115,10 @@ class VersionRow:
     """One version of an application.
 
     Attributes:
+        number: of the version; the first is 1.
         wall_time: unix time of its request.
         by: principal that requested it; "": unknown.
+        processes: number of its processes.
         note: origin of the version, if it is not a file.
         given_up: why the master returned to another version; "": it did not.
         wanted: it is the desired state.
@@ -127,6 +138,12 @@ class ApplicationRow:
     """One application.
 
     Attributes:
+        name: of the application.
+        owner: principal that applied it first; "": unknown.
+        state: "applying": processes are being started, stopped or replaced; "returning": the former
+            version is being applied again; "running": all is as desired; "degraded": a process has
+            failed or does not run; "paused": a replacement has failed; "cancelled": no version is
+            desired.
         version: number of the desired version; 0: it is cancelled.
         pending: name of each process that is not yet as desired, to the reason; also of one whose
             host has not reported since the master started.

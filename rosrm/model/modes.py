@@ -60,7 +60,12 @@ class ModeRow:
     """One mode, as it is listed.
 
     Attributes:
+        name: of the mode.
         state: "in force"; "switching": its applications are not as desired yet; "": neither.
+        applications: names of its applications.
+        limits: resource to the highest fraction, 0 to 1, that any host may use in this mode.
+        weights: resource to its weight, 0 to 1, in the scoring policies; empty: the weights of the
+            cluster.
         when: condition that puts it into force; "": none.
         reason: why it was left, or not reached, when this was tried last; "": it was not.
     """

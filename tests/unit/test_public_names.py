@@ -20,10 +20,10 @@ PUBLIC = ("rosrm.node", "rosrm.testing")
 MORE = {
     "plugins/migration/rosrm_migration/handoff.py": {"rosrm.ros.slave.publisher_watch"},
     "examples/rosrm_examples/demo_job.py": {"rosrm.config.settings"},
-    "examples/rosrm_examples/demo_run.py": {"rosrm.model.applications", "rosrm.supervisor.client"},
+    "examples/rosrm_examples/demo_run.py": {"rosrm.supervisor.client"},
     "examples/rosrm_examples/demo_screen.py": {"rosrm.cli.output.top"},
     "examples/rosrm_examples/migration_job.py": {"rosrm.config.settings"},
-    "examples/rosrm_examples/rollout_job.py": {"rosrm.config.settings", "rosrm.model.applications"},
+    "examples/rosrm_examples/rollout_job.py": {"rosrm.config.settings"},
 }
 PROGRAMS = [
     path
