@@ -23,8 +23,8 @@ _CONTROLLERS: Final = ("memory", "cpuacct", "cpu")
 _TRIES: Final = 10
 _CAP_SYS_NICE: Final = 1 << 23
 _HOW: Final = (
-    "give the unit of the slave `Delegate=yes` and `DelegateSubgroup=rosrm-agent`, or start it "
-    "with `systemd-run --user --scope -p Delegate=yes rosrm slave`"
+    "start the slave by the unit that `rosrm service install slave` writes, or "
+    "by `systemd-run --user --scope -p Delegate=yes rosrm slave`"
 )
 
 

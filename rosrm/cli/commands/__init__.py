@@ -32,6 +32,7 @@ from rosrm.cli.commands import (
     plugin,
     run,
     runtimes,
+    service,
     up,
 )
 from rosrm.cli.groups import DISTRIBUTIONS, PlainCommand, PlainGroup, add_command, hint_after
@@ -134,6 +135,7 @@ app.command(cls=PlainCommand, context_settings={"allow_interspersed_args": False
 add_command(app, "config", check.config)
 add_command(app, "key", key.key)
 add_command(app, "plugin", plugin.plugin)
+add_command(app, "service", service.service)
 
 
 def keep_only(arguments: Sequence[str]) -> None:
