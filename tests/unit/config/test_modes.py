@@ -6,6 +6,7 @@ import pytest
 
 from rosrm.config.modes import load_modes
 from rosrm.model.modes import Trigger
+from rosrm.slave.launch.parameter_files import all_parameters
 
 NAVIGATION = """\
 app: navigation
@@ -50,6 +51,31 @@ def test_every_key_of_a_mode_is_read(file) -> None:
     assert exploring.weights == {"memory": 1.0, "cpu": 0.2}
     assert (exploring.when, docked.when) == (Trigger("", "memory", 30.0), Trigger("robot-2"))
     assert docked.targets[0].specs[0].parameters["speed"] == 1.0
+
+
+def test_the_parameters_of_a_mode_override_a_list_of_parameters(file, tmp_path) -> None:
+    """Also those of a parameters file on the host that names the node."""
+    section = "/nav/planner: {ros__parameters: {speed: 2.0, frame: {id: base}, rate: 5}}"
+    path = tmp_path / "robot.params.yaml"
+    path.write_text(section, encoding="utf-8")
+    (tmp_path / "navigation.yaml").write_text(
+        "app: navigation\nprocesses:\n  - name: planner\n    namespace: /nav\n    package: nav\n"
+        f"    executable: planner\n    parameters: [{{speed: 1.0}}, {path}]\n",
+        encoding="utf-8",
+    )
+    (mode,) = load_modes(
+        file(
+            """
+            modes:
+              slow:
+                applications: navigation.yaml
+                parameters: {planner: {speed: 0.5, frame: {id: odom}}}
+            """
+        )
+    )
+    ((planner,),) = (target.specs for target in mode.targets)
+    found = all_parameters(planner, "planner")
+    assert found == {"/**": {"speed": 0.5, "frame.id": "odom", "rate": 5}}
 
 
 @pytest.mark.parametrize(
