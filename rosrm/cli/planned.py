@@ -1,11 +1,14 @@
-"""Comparison of a kept plan with the plan of now, and of a plan with its result."""
+"""Kept plans of `apply`, `revert` and `mode`: their requests, compared with plan and result."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
+from typing import Protocol
 
+from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError, Refused
 from rosrm.model.applications import Action, ApplyResult, PlannedAction
 from rosrm.model.codec import from_plain
@@ -13,8 +16,20 @@ from rosrm.model.rows import ProcessRow
 from rosrm.wording import few, listed
 
 
-def read_plan(path: str) -> ApplyResult:
-    """Return the plan that `rosrm apply --plan --json` has printed into a file."""
+class Request(Protocol):
+    """A request on applications with its arguments, such as the desired targets."""
+
+    def __call__(self, *, plan_only: bool = False) -> ApplyResult:
+        """Make the request, or return its plan."""
+
+
+def read_plan(path: str) -> ApplyResult | None:
+    """Return the plan that a command with `--plan --json` has printed into a file.
+
+    `path`: "": there is none.
+    """
+    if not path:
+        return None
     try:
         return from_plain(ApplyResult, json.loads(Path(path).read_bytes()))
     except OSError as fault:
@@ -24,8 +39,29 @@ def read_plan(path: str) -> ApplyResult:
     except (KeyError, TypeError, ValueError) as fault:
         why = str(fault)
     raise ConfigError(
-        f"--as-planned: {path}: {why}; `rosrm apply WORK --plan --json > FILE` writes a plan"
+        f"--as-planned: {path}: {why}; the same command with `--plan --json > FILE` writes a plan"
     )
+
+
+def as_planned(planned: ApplyResult | None, request: Request) -> Request:
+    """Return a request that is only made if a kept plan of it still holds.
+
+    It prints what differs by other readings, and returns the actions with the hosts planned now.
+
+    Args:
+        planned: the kept plan; None: there is none.
+        request: the request without a condition.
+    """
+    if planned is None:
+        return request
+
+    def checked(*, plan_only: bool = False) -> ApplyResult:
+        now = request(plan_only=True)
+        for text in differences(planned, now):
+            echo(f"rosrm: other readings than at the time of the plan: {text}", err=True)
+        return now if plan_only else replace(request(), actions=now.actions)
+
+    return checked
 
 
 def differences(planned: ApplyResult, now: ApplyResult) -> list[str]:

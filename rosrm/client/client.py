@@ -174,7 +174,12 @@ class Client:
             mode: its name.
             plan_only: True: return the actions that would follow, and begin none.
         """
-        return self._master.switch_mode(mode, plan_only=plan_only)
+        if not plan_only:
+            return self._master.switch_mode(mode)
+        # Listed first: a mode that is loaded between the two requests differs from this digest.
+        digests = {row.name: row.digest for row in self.list_modes()}
+        planned = self._master.switch_mode(mode, plan_only=True)
+        return replace(planned, work=digests.get(mode, ""))
 
     def list_modes(self) -> Sequence[ModeRow]:
         """Return all modes, in the order of their file."""

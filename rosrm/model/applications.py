@@ -97,8 +97,8 @@ class ApplyResult:
     Attributes:
         message: the master's message.
         actions: actions that follow, or would follow; (): everything is as desired.
-        work: digest of the requested work, which tells a plan from that of other work; "": the
-            work was not sent by this client.
+        work: digest of the requested work, which tells a plan from that of other work; "": unknown,
+            as in the answer to a switch of modes that is not a plan.
     """
 
     message: str

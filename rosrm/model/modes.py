@@ -41,6 +41,8 @@ class Mode:
         limits: resource to the highest fraction of it that any host may use.
         weights: resource to its weight in the scoring policies; empty: the weights of the cluster.
         when: condition that puts the mode into force.
+        digest: digest of all this, by which a client tells two modes of one name apart; the master
+            computes it when the mode is loaded.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Mode:
     limits: Mapping[str, float] = field(default_factory=lambda: EMPTY)
     weights: Mapping[str, float] = field(default_factory=lambda: EMPTY)
     when: Trigger = Trigger()
+    digest: str = ""
 
     @property
     def applications(self) -> tuple[str, ...]:
@@ -68,6 +71,7 @@ class ModeRow:
             cluster.
         when: condition that puts it into force; "": none.
         reason: why it was left, or not reached, when this was tried last; "": it was not.
+        digest: digest of its contents; another one: the mode was loaded with other contents since.
     """
 
     name: str
@@ -77,3 +81,4 @@ class ModeRow:
     weights: Mapping[str, float] = field(default_factory=lambda: EMPTY)
     when: str = ""
     reason: str = ""
+    digest: str = ""

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from rosrm.client.client import Client
 from rosrm.client.waiting import wait_for_mode
 from rosrm.config.modes import load_modes
 from rosrm.config.settings import LivenessSettings
@@ -21,7 +22,8 @@ STOP = {"interrupt_grace": 0.5, "terminate_grace": 0.5}
 
 def work(directory: Path, app: str, *names: str, **fields: object) -> str:
     """Write the work file of an application, and return its name."""
-    parts = [{"name": name, "command": ["sleep", "1000"], "stop": STOP, **fields} for name in names]
+    shared = {"command": ["sleep", "1000"], "stop": STOP, **fields}
+    parts = [{"name": name, **shared} for name in names]
     content = {"app": app, "rollout": {"healthy_for": 0.2}, "processes": parts}
     (directory / f"{app}.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     return f"{app}.yaml"
@@ -76,6 +78,23 @@ def test_a_switch_keeps_the_pids_of_what_both_modes_share(make_cluster) -> None:
     assert {name: cluster.process(name).pid for name in pids} == pids
     (row,) = cluster.client.list(hosts=True).hosts
     assert {one.name: one.limit for one in row.resources}["memory"] == 0.5
+
+
+def test_a_mode_that_is_loaded_with_other_contents_is_other_work(make_cluster) -> None:
+    """A kept plan then holds no more, even if no action of it differs."""
+    cluster = make_cluster(host("a"))
+    client = Client(connection=cluster.client)
+
+    def work_of_a_plan(seconds: str) -> str:
+        dock = work(cluster.directory, "docking", "charger", command=["sleep", seconds])
+        load(cluster, {"docked": {"applications": [dock]}})
+        planned = client.switch_mode("docked", plan_only=True)
+        assert [one.process for one in planned.actions] == ["charger"]
+        return planned.work
+
+    first = work_of_a_plan("1000")
+    assert work_of_a_plan("1000") == first
+    assert work_of_a_plan("2000") != first
 
 
 def test_a_lost_host_puts_a_mode_into_force(make_cluster) -> None:

@@ -5,8 +5,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -18,8 +18,9 @@ from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 
 if TYPE_CHECKING:
+    from rosrm.cli.planned import Request
     from rosrm.client.client import Client
-    from rosrm.model.applications import ApplyResult, Target
+    from rosrm.model.applications import ApplyResult
 
 Application = Annotated[str, typer.Argument(metavar="APP", help="Name of an application.")]
 Plan = Annotated[
@@ -61,43 +62,27 @@ def apply(  # noqa: PLR0917 - an argument for each option
     replaced, and all others are not touched. Without --plan: waits for the result, and exits with 1
     if an application is not as described then.
     """
-    from rosrm.cli.planned import read_plan
+    from rosrm.cli import planned
     from rosrm.config.work import load_application
 
     targets = [load_application(file) for file in files]
-    planned = read_plan(as_planned) if as_planned else None
+    kept = planned.read_plan(as_planned)
 
-    def ask(client: Client) -> ApplyResult:
-        if planned is None:
-            return client.apply_targets(targets, plan_only=plan)
-        return _as_planned(client, targets, planned, plan_only=plan)
+    def prepare(client: Client) -> Request:
+        return planned.as_planned(kept, partial(client.apply_targets, targets))
 
     names = [target.application for target in targets]
-    carry_out(ctx, names, ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
+    carry_out(ctx, names, prepare, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
 
 
-def _as_planned(
-    client: Client, targets: Sequence[Target], planned: ApplyResult, *, plan_only: bool
-) -> ApplyResult:
-    """Apply targets if a kept plan still holds, and print what differs by other readings.
-
-    Return the actions with the hosts that are planned now.
-    """
-    from rosrm.cli.planned import differences
-
-    now = client.apply_targets(targets, plan_only=True)
-    for text in differences(planned, now):
-        echo(f"rosrm: other readings than at the time of the plan: {text}", err=True)
-    return now if plan_only else replace(client.apply_targets(targets), actions=now.actions)
-
-
-def revert(  # noqa: PLR0917 - an argument for each option
+def revert(  # noqa: PLR0913, PLR0917 - an argument for each option
     ctx: typer.Context,
     application: Application,
     to: Annotated[
         int, typer.Option("--to", metavar="N", min=0, help="Version; default: the one before.")
     ] = 0,
     plan: Plan = False,
+    as_planned: AsPlanned = "",
     no_wait: NoWait = False,
     timeout: Timeout = "",
     as_json: AsJson = False,
@@ -107,11 +92,16 @@ def revert(  # noqa: PLR0917 - an argument for each option
 
     `rosrm history APP` lists the versions.
     """
+    from rosrm.cli import planned
 
-    def ask(client: Client) -> ApplyResult:
-        return client.revert(application, to or _before(client, application), plan_only=plan)
+    kept = planned.read_plan(as_planned)
 
-    carry_out(ctx, [application], ask, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
+    def prepare(client: Client) -> Request:
+        version = to or _before(client, application)
+        return planned.as_planned(kept, partial(client.revert, application, version))
+
+    name = [application]
+    carry_out(ctx, name, prepare, domain, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
 
 
 def _before(client: Client, application: str) -> int:
@@ -128,40 +118,67 @@ def _before(client: Client, application: str) -> int:
 
 
 def carry_out(
-    ctx: typer.Context, names: list[str], ask: Callable[[Client], ApplyResult],
+    ctx: typer.Context, names: list[str], prepare: Callable[[Client], Request],
     domain: int | None, timeout: str, *, plan: bool, no_wait: bool, as_json: bool,
 ) -> None:  # fmt: skip
-    """Send a request on applications; show its plan, or wait for its end."""
-    from rosrm.cli.output import applications, json_forms, tables
-    from rosrm.cli.planned import elsewhere
+    """Send a request on applications; show its plan, or wait for its end.
+
+    Args:
+        ctx: of the command.
+        names: of the applications.
+        prepare: returns the request, given the client with which to make it.
+        domain: ROS domain; None: that of the environment.
+        timeout: duration of the wait as text; "": no limit.
+        plan: the request is only planned.
+        no_wait: the command ends once the master has accepted the request.
+        as_json: the answer is shown as JSON.
+    """
+    from rosrm.cli.output import applications
     from rosrm.cli.waiting import interruptible, longest
 
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
-        result = ask(client)
-        if as_json:
-            json_forms.show(json_forms.forms([result])[0])
-        else:
-            echo(result.message)
-            if plan and result.actions:
-                tables.show(applications.actions(result.actions))
-        if plan:
-            raise typer.Exit(DIFFERS if result.actions else 0)
-        if no_wait:
-            return
+        result = begin(prepare(client), plan=plan, no_wait=no_wait, as_json=as_json)
         with interruptible("the applications change further (`rosrm apps`)"):
             rows = client.wait_for_applications(
                 names, timeout=limit, on_change=applications.show_progress
             )
-        if any(action.host for action in result.actions):  # they are those of a plan
-            for text in elsewhere(result.actions, client.list_processes()):
-                echo(f"rosrm: other than planned: {text}", err=True)
+        print_elsewhere(client, result)
     shown = [applications.show_end(row) for row in rows]
     missing = set(names).difference(row.name for row in rows)
     for name in sorted(missing):
         echo(f"rosrm: {name} is no longer listed", err=True)
     if missing or not all(shown):
         raise typer.Exit(1)
+
+
+def begin(request: Request, *, plan: bool, no_wait: bool, as_json: bool) -> ApplyResult:
+    """Make a request, and show its result.
+
+    Raises:
+        typer.Exit: the result is a plan, or its end is not awaited.
+    """
+    from rosrm.cli.output import applications, json_forms, tables
+
+    result = request(plan_only=plan)
+    if as_json:
+        json_forms.show(json_forms.forms([result])[0])
+    else:
+        echo(result.message)
+        if plan and result.actions:
+            tables.show(applications.actions(result.actions))
+    if plan or no_wait:
+        raise typer.Exit(DIFFERS if plan and result.actions else 0)
+    return result
+
+
+def print_elsewhere(client: Client, result: ApplyResult) -> None:
+    """Print which processes are on other hosts than in a kept plan."""
+    from rosrm.cli.planned import elsewhere
+
+    if any(action.host for action in result.actions):  # they are those of a plan
+        for text in elsewhere(result.actions, client.list_processes()):
+            echo(f"rosrm: other than planned: {text}", err=True)
 
 
 def apps(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:

@@ -5,23 +5,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.commands.applications import DIFFERS, NoWait, Plan
+from rosrm.cli.commands.applications import AsPlanned, NoWait, Plan, begin, print_elsewhere
 from rosrm.cli.commands.change import Timeout
 from rosrm.cli.options import AsJson, Domain
 from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 
 if TYPE_CHECKING:
+    from rosrm.cli.planned import Request
     from rosrm.client.client import Client
 
 
-def mode(  # noqa: PLR0917 - an argument for each option
+def mode(  # noqa: PLR0913, PLR0917 - an argument for each option
     ctx: typer.Context,
     name: Annotated[
         str, typer.Argument(metavar="MODE", help="Mode to switch to; default: list the modes.")
@@ -33,6 +35,7 @@ def mode(  # noqa: PLR0917 - an argument for each option
         ),
     ] = None,
     plan: Plan = False,
+    as_planned: AsPlanned = "",
     no_wait: NoWait = False,
     timeout: Timeout = "",
     as_json: AsJson = False,
@@ -44,13 +47,18 @@ def mode(  # noqa: PLR0917 - an argument for each option
     the mode in force has, and touches nothing else. It waits for the result, and exits with 1 if
     the mode is not in force then.
     """
-    if plan and not name:
-        raise ConfigError("--plan: give the mode, too: `rosrm mode NAME --plan`")
+    from rosrm.cli import planned
+
+    if (plan or as_planned) and not name:
+        option = "--plan" if plan else "--as-planned"
+        raise ConfigError(f"{option}: give the mode, too: `rosrm mode NAME {option}`")
+    kept = planned.read_plan(as_planned)
     with connection.master(ctx, domain) as client:
         if load is not None:
             echo(client.load_modes(load), err=as_json)
         if name:
-            _switch(client, name, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
+            request = planned.as_planned(kept, partial(client.switch_mode, name))
+            _switch(client, name, request, timeout, plan=plan, no_wait=no_wait, as_json=as_json)
         elif load is None:
             _show(client, as_json=as_json)
 
@@ -69,26 +77,18 @@ def _show(client: Client, *, as_json: bool) -> None:
 
 
 def _switch(
-    client: Client, name: str, timeout: str, *, plan: bool, no_wait: bool, as_json: bool
-) -> None:
+    client: Client, name: str, request: Request, timeout: str, *,
+    plan: bool, no_wait: bool, as_json: bool,
+) -> None:  # fmt: skip
     """Request a mode; show its plan, or wait until it is in force."""
-    from rosrm.cli.output import applications, json_forms, modes, tables
+    from rosrm.cli.output import applications, modes
     from rosrm.cli.waiting import interruptible, longest
 
     limit = longest(timeout)
-    result = client.switch_mode(name, plan_only=plan)
-    if as_json:
-        json_forms.show(json_forms.forms([result])[0])
-    else:
-        echo(result.message)
-        if plan and result.actions:
-            tables.show(applications.actions(result.actions))
-    if plan:
-        raise typer.Exit(DIFFERS if result.actions else 0)
-    if no_wait:
-        return
+    result = begin(request, plan=plan, no_wait=no_wait, as_json=as_json)
     with interruptible("the cluster goes on with the switch (`rosrm mode`)"):
         rows = client.wait_for_mode(timeout=limit, on_change=applications.show_progress)
+    print_elsewhere(client, result)
     if not modes.show_end(rows, name):
         raise typer.Exit(1)
 

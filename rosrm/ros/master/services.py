@@ -33,6 +33,7 @@ from rosrm.ros.master.known_specs import KnownSpecs
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
+from rosrm.ros.spec_digests import digest_of
 from rosrm.runtime.local_zone import local_zone
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm.wording import sanitized
@@ -201,9 +202,8 @@ class MasterServices:
     def _modes_loaded(
         self, request: srv.LoadModes.Request, token: int, peer: Peer
     ) -> happened.Event:
-        modes = tuple(
-            convert.mode_from_msg(one, self._targets(one.targets)) for one in request.modes
-        )
+        found = [convert.mode_from_msg(one, self._targets(one.targets)) for one in request.modes]
+        modes = tuple(replace(mode, digest=digest_of(mode)) for mode in found)
         return happened.ModesLoaded(token, modes, _requester(peer))
 
     def _specs_of(self, target: Any, by: Requester) -> tuple[ProcessSpec, ...]:

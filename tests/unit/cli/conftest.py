@@ -81,6 +81,7 @@ class FakeClient:
     plugins: list = field(default_factory=lambda: list(PLUGINS))
     events: list = field(default_factory=lambda: list(EVENTS))
     applications: list = field(default_factory=list)
+    modes: list = field(default_factory=list)
     trouble: str = ""
     security: str = "keys"
     strangers: str = ""
@@ -149,6 +150,7 @@ class FakeClient:
             hosts=self.hosts if hosts else (), processes=self.processes if processes else (),
             plugins=[row for row in self.plugins if plugins and plugins in (True, row.state)],
             applications=self.applications if applications else (),
+            modes=self.modes if modes else (),
             events=chosen[-(newest or 1000) :] if events else (),
         )  # fmt: skip
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -18,9 +19,8 @@ from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rosrm.client.client import Client
     from rosrm.config.documents import Node
-    from rosrm.model.applications import ApplyResult, Target
+    from rosrm.model.applications import Target
     from rosrm_launch.model import Argument, Omission
     from rosrm_launch.translate import Translation
 
@@ -104,12 +104,9 @@ def launch(  # noqa: PLR0913, PLR0917 - an argument for each option
         _show_yaml(work)
         return
 
-    def ask(client: Client) -> ApplyResult:
-        return client.apply_targets([target], plan_only=dry_run)
-
     carry_out(
-        ctx, [target.application], ask, domain, timeout,
-        plan=dry_run, no_wait=no_wait, as_json=as_json,
+        ctx, [target.application], lambda client: partial(client.apply_targets, [target]),
+        domain, timeout, plan=dry_run, no_wait=no_wait, as_json=as_json,
     )  # fmt: skip
 
 

@@ -266,6 +266,7 @@ def mode_rows(state: MasterState) -> Sequence[ModeRow]:
         ModeRow(
             mode.name, in_force if mode.name == modes.wanted else "", mode.applications,
             mode.limits, mode.weights, str(mode.when), modes.fault.get(mode.name, ""),
+            mode.digest,
         )
         for mode in modes.known.values()
     ]  # fmt: skip
