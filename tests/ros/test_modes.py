@@ -1,8 +1,9 @@
-"""Modes on a real cluster: what both share runs on, and a lost host switches by itself."""
+"""Modes on a real cluster: what both share runs on, and conditions begin a switch."""
 
 from __future__ import annotations
 
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -14,10 +15,17 @@ from rosrm.config.modes import load_modes
 from rosrm.config.settings import LivenessSettings
 from rosrm.errors import Refused
 from rosrm.model.modes import ModeRow
-from tests.ros.clusters import Cluster, host
+from tests.ros.clusters import MIB, STEADY, Cluster, host
 from tests.waiting import PATIENCE
 
 STOP = {"interrupt_grace": 0.5, "terminate_grace": 0.5}
+#: Takes memory once a file exists.
+GROWS = """
+import os, sys, time
+while not os.path.exists(sys.argv[1]): time.sleep(0.02)
+taken = b"1" * int(sys.argv[2])
+time.sleep(1000)
+"""
 
 
 def work(directory: Path, app: str, *names: str, **fields: object) -> str:
@@ -120,4 +128,36 @@ def test_a_lost_host_puts_a_mode_into_force(make_cluster) -> None:
     cluster.wait_for_event("mode_begins", "switches to the mode degraded: b is lost")
     assert reach(cluster)["degraded"].state == "in force"
     assert cluster.wait("watcher", "running").host == "a"
+    assert cluster.process("planner").pid == pid
+
+
+def test_a_host_over_its_limit_puts_a_mode_into_force(make_cluster) -> None:
+    """A slave's reading begins the condition, and the switch follows after the time of the mode."""
+    lasts = 1.5  # seconds
+    limits = {"memory": 0.5, "cpu": 1.0}
+    cluster = make_cluster(host("a", memory=400 * MIB, limits=limits), liveness=STEADY)
+    go = cluster.directory / "go"
+    grows = [sys.executable, "-ISc", GROWS, str(go), str(250 * MIB)]
+    nav = work(cluster.directory, "navigation", "planner")
+    mapping = work(cluster.directory, "mapping", "mapper", command=grows)
+    when = {"over_limit": "memory", "for": f"{lasts}s"}
+    load(
+        cluster,
+        {
+            "usual": {"applications": [nav, mapping]},
+            "degraded": {"applications": [nav], "when": when},
+        },
+    )
+    cluster.client.switch_mode("usual")
+    assert reach(cluster)["usual"].state == "in force"
+    pid = cluster.wait("planner", "running").pid
+    assert cluster.events("over_limit") == []
+    go.touch()
+    over = cluster.wait_for_event("over_limit", "memory", host="a")
+    begun = cluster.wait_for_event("mode_begins", "degraded: a host is over its limit of memory")
+    assert begun.elapsed - over.elapsed >= lasts - 0.05
+    assert reach(cluster)["degraded"].state == "in force"
+    assert cluster.wait("mapper", "cancelled")
+    cluster.wait_for_event("under_limit", host="a")
+    assert reach(cluster)["degraded"].state == "in force"
     assert cluster.process("planner").pid == pid
