@@ -158,6 +158,27 @@ def test_an_array_runs_once_however_often_it_is_applied(cluster: Cluster) -> Non
     cancel(cluster, "film")
 
 
+def test_an_apply_of_an_unchanged_file_leaves_schedules_alone(cluster: Cluster) -> None:
+    """Runs follow at their times, and the apply starts none."""
+    jobs = [
+        {"name": name, "kind": "job", "every": every, "command": ["true"]}
+        for name, every in (("often", "1s"), ("hourly", "1h"))
+    ]
+
+    def runs(name: str) -> int:
+        return len(cluster.events("finished", process=name))
+
+    assert apply(cluster, "clock", *jobs) == {"often": "start", "hourly": "start"}
+    wait_until(lambda: runs("often") >= 2, "two runs of often", pause=cluster.client.spin)
+    following = cluster.wait("hourly", "scheduled").next_run
+    before = runs("often")
+    assert apply(cluster, "clock", *jobs) == {}
+    wait_until(lambda: runs("often") >= before + 2, "two more runs", pause=cluster.client.spin)
+    hourly = cluster.wait("hourly", "scheduled")
+    assert (runs("hourly"), hourly.next_run) == (1, following)
+    cancel(cluster, "clock")
+
+
 def test_a_client_sends_known_processes_only_once(cluster: Cluster, monkeypatch) -> None:
     """Their digest suffices for the next requests; a master that was restarted asks for them."""
     sent: list[str] = []
