@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.model.links import MEASURE_SECONDS, LinkPeer
-from rosrm.model.values import EMPTY, Assignment, InstanceId, RestartPolicy
+from rosrm.model.values import EMPTY, Amendment, Assignment, InstanceId
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +43,16 @@ class RestartInstance:
     instance: InstanceId
 
 
+#: A slave's code of the refusal of an `AmendInstance`.
+NOT_AMENDED: Final = "not_amended"
+
+
 @dataclass(frozen=True, slots=True)
-class SetRestartPolicy:
-    """Replace the restart policy of an instance, which is no shadow from then on."""
+class AmendInstance:
+    """Change an instance that runs on, and is no shadow from then on."""
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,12 +114,7 @@ class MeasureLinks:
 
 #: Orders to the slave's core.
 InstanceOrder = (
-    StartInstance
-    | StopInstance
-    | FenceInstance
-    | RestartInstance
-    | SetRestartPolicy
-    | ReportInstances
+    StartInstance | StopInstance | FenceInstance | RestartInstance | AmendInstance | ReportInstances
 )
 Order = (
     InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | ReloadSettings | MeasureLinks

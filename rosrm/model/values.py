@@ -246,6 +246,18 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
+class Amendment:
+    """Changes of an instance that runs on.
+
+    Attributes:
+        limits: None: they stay.
+    """
+
+    restart: RestartPolicy
+    limits: Limits | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Realtime:
     """Real-time scheduling of a process.
 

@@ -27,12 +27,12 @@ from rosrm.core.master.commands import (
 )
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.orders import (
+    AmendInstance,
     FenceInstance,
     Order,
     ReportInstances,
     RestartInstance,
     RunExecutor,
-    SetRestartPolicy,
     StartInstance,
     StopInstance,
 )
@@ -56,7 +56,7 @@ _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
         StopInstance: "stop",
         FenceInstance: "fence",
         RestartInstance: "restart",
-        SetRestartPolicy: "set_restart",
+        AmendInstance: "set_restart",  # its name in rosrm 0.1.0
         RunExecutor: "execute",
         ReportInstances: "report",
     }

@@ -71,6 +71,7 @@ _OTHER_ENTRIES: Final = {
     "StartOrder.after": 256,
     "ProcessStatusBatch.failing": 1000,
     "ProcessUsage.others": 16,
+    "ControlHost_Request.limits": 1,
     "Sealed.body": 1 << 24,
     "Submit_Request.processes": 10_000,
     "Apply_Request.targets": 1000,

@@ -489,6 +489,20 @@ def restart_from_msg(message: msg.RestartPolicy) -> values.RestartPolicy:
     return _from_msg(values.RestartPolicy, message)
 
 
+def limits_to_msg(limits: values.Limits) -> msg.Limits:
+    """Return limits as a message."""
+    return _to_msg(msg.Limits, limits)
+
+
+def limits_from_msg(message: msg.Limits) -> values.Limits:
+    """Return the inverse of `limits_to_msg`; raises `Refused` for impossible limits."""
+    limits = _from_msg(values.Limits, message)
+    fault = limits_fault(values.ProcessSpec("", limits=limits))
+    if fault:
+        raise Refused(fault)
+    return limits
+
+
 def _restart_fault(message: msg.RestartPolicy) -> str:
     allowed = get_args(values.RestartCondition)
     if message.when not in allowed:

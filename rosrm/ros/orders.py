@@ -11,6 +11,7 @@ from rosrm.model.description_checks import name_fault
 from rosrm.model.durations import LONGEST
 from rosrm.model.links import peer_to_json, peers_from_json
 from rosrm.model.orders import (
+    AmendInstance,
     DropReplica,
     FenceInstance,
     MeasureLinks,
@@ -20,11 +21,10 @@ from rosrm.model.orders import (
     ReportInstances,
     RestartInstance,
     RunExecutor,
-    SetRestartPolicy,
     StartInstance,
     StopInstance,
 )
-from rosrm.model.values import InstanceId
+from rosrm.model.values import Amendment, InstanceId
 from rosrm.ros import convert
 from rosrm_msgs import srv
 
@@ -35,7 +35,7 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     StartInstance: _Request.START,
     RunExecutor: _Request.EXECUTE,
     ReportInstances: _Request.REPORT,
-    SetRestartPolicy: _Request.SET_RESTART,
+    AmendInstance: _Request.AMEND,
     FenceInstance: _Request.FENCE,
     ReplicateSnapshot: _Request.REPLICATE,
     DropReplica: _Request.DROP_REPLICA,
@@ -64,8 +64,10 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
             return request
         case StartInstance(assignment):
             request.assignment = convert.assignment_to_msg(assignment)
-        case SetRestartPolicy(_, restart):
-            request.restart = convert.restart_to_msg(restart)
+        case AmendInstance(_, amendment):
+            request.restart = convert.restart_to_msg(amendment.restart)
+            if amendment.limits is not None:
+                request.limits = [convert.limits_to_msg(amendment.limits)]
         case ReplicateSnapshot(_, hosts, every):
             request.replicate_to, request.replicate_every = list(hosts), float(every)
     request.instance = convert.instance_to_msg(order.instance)
@@ -90,13 +92,18 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
             return ReportInstances()
         case _Request.RELOAD:
             return ReloadSettings()
-        case _Request.SET_RESTART:
-            return SetRestartPolicy(instance, convert.restart_from_msg(request.restart))
+        case _Request.AMEND:
+            return AmendInstance(instance, _amendment(request))
         case _Request.REPLICATE:
             return ReplicateSnapshot(instance, tuple(request.replicate_to), request.replicate_every)
     if request.action not in _OF_INSTANCE:
         raise Refused(f"unknown action {request.action}")
     return _OF_INSTANCE[request.action](instance)
+
+
+def _amendment(request: srv.ControlHost.Request) -> Amendment:
+    (limits,) = map(convert.limits_from_msg, request.limits) if request.limits else (None,)
+    return Amendment(convert.restart_from_msg(request.restart), limits)
 
 
 def _measure_links(arguments: str) -> MeasureLinks:

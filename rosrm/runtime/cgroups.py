@@ -24,6 +24,8 @@ _PERIOD: Final = 0.02
 _LONG_PERIOD: Final = 0.1
 #: Cores; below this the share of a short period is less than the least possible, a millisecond.
 _SHORT_ENOUGH: Final = 0.05
+#: No limit, in a control file of version 2.
+_NONE: Final = "max"
 _ESCAPE: Final = re.compile(r"\\([0-7]{3})")
 
 
@@ -83,14 +85,23 @@ def own_group(mount: Mount, root: str = "/") -> str | None:
 
 
 def memory_files(version: int, size: int) -> list[tuple[str, str]]:
-    """Return the control files of a limit of memory in bytes, in order, with their content."""
+    """Return the control files of a limit of memory in bytes, in order, with their content.
+
+    The order is that of a limit that is set or lowered. Size 0: no limit.
+    """
     if version == 1:
-        return [("memory.limit_in_bytes", str(size)), ("memory.memsw.limit_in_bytes", str(size))]
-    return [("memory.max", str(size)), ("memory.swap.max", "0")]
+        names = "memory.limit_in_bytes", "memory.memsw.limit_in_bytes"
+        return [(name, str(size or -1)) for name in names]
+    return [("memory.max", str(size or _NONE)), ("memory.swap.max", "0" if size else _NONE)]
 
 
 def cpu_files(version: int, cores: float) -> list[tuple[str, str]]:
-    """Return the control files of a limit of CPU time, in order, with their content."""
+    """Return the control files of a limit of CPU time, in order, with their content.
+
+    The limit of a group above may be lower, and then holds. 0 cores: no limit.
+    """
+    if not cores:
+        return [("cpu.cfs_quota_us", "-1") if version == 1 else ("cpu.max", _NONE)]
     seconds = _PERIOD if cores >= _SHORT_ENOUGH else _LONG_PERIOD
     quota, period = round(cores * seconds * 1e6), round(seconds * 1e6)
     if version == 1:

@@ -29,15 +29,15 @@ from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
-from rosrm.model.orders import MeasureLinks, RunExecutor, SetRestartPolicy
+from rosrm.model.orders import AmendInstance, MeasureLinks, RunExecutor
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
+    Amendment,
     HostDescription,
     InstanceId,
     InstanceState,
     InstanceStatus,
-    RestartPolicy,
 )
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
@@ -122,7 +122,7 @@ class SlaveRuntime:
         )
         self._events: deque[Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
-        self._unsettled: dict[tuple[InstanceId, RestartPolicy], list[Settled]] = {}
+        self._unsettled: dict[tuple[InstanceId, Amendment], list[Settled]] = {}
         self._executors = Executors(
             registry.executors(config.strategies), registry.broken_strategies(),
             post=self._post, changed=self._note_executors,
@@ -239,7 +239,7 @@ class SlaveRuntime:
             report=lambda one, reason: self._take(StartDelayed(one, reason)),
         )  # fmt: skip
         duties = Duties(
-            self._take, self._set_restart, self._replication.keep, self._drop_snapshots,
+            self._take, self._amend, self._replication.keep, self._drop_snapshots,
             self._execute, self._read_log, self._measure_links, self._reload,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
@@ -504,7 +504,7 @@ class SlaveRuntime:
         elif isinstance(command, commands.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
         elif isinstance(command, commands.Settle):
-            for settled in self._unsettled.pop((command.instance, command.restart), []):
+            for settled in self._unsettled.pop((command.instance, command.amendment), []):
                 settled(command.refusal)
         else:
             self._have_supervisor(command)
@@ -526,9 +526,9 @@ class SlaveRuntime:
 
     # --- requests of the master, and of readers of logs ----------------------------------
 
-    def _set_restart(self, order: SetRestartPolicy, settled: Settled) -> None:
-        """Set the restart policy of an instance; call `settled` when the supervisor recorded it."""
-        self._unsettled.setdefault((order.instance, order.restart), []).append(settled)
+    def _amend(self, order: AmendInstance, settled: Settled) -> None:
+        """Change an instance; call `settled` when the supervisor has recorded or refused it."""
+        self._unsettled.setdefault((order.instance, order.amendment), []).append(settled)
         self._take(event_of(order))
 
     def _drop_snapshots(self, instance: InstanceId) -> None:

@@ -33,6 +33,7 @@ from rosrm.supervisor.client_values import (
     SupervisorMessage,
     key_of,
     restart_rule,
+    run_limits,
 )
 from rosrm.supervisor.logs import LogLimits
 from rosrm.wording import counted
@@ -43,6 +44,9 @@ _log = logging.getLogger("rosrm.slave")
 _PATIENCE: Final = 30.0
 #: Seconds for which orders may wait before a message to the user.
 _LOGGED_AFTER: Final = 5.0
+_OF_EARLIER_VERSION: Final = (
+    "the supervisor there is of an earlier version, and cannot change limits of a running process"
+)
 
 
 class SupervisorLink:
@@ -119,9 +123,20 @@ class SupervisorLink:
         """Send a command of the core."""
         if isinstance(command, commands.Stop | commands.Fence):
             self._unanswered.pop(command.instance, None)
+        if isinstance(command, commands.Amend):
+            command = self._amendable(command)
         with contextlib.suppress(SupervisorGone):
             self._client.send(_order_of(command))
         self._log_waits()
+
+    def _amendable(self, command: commands.Amend) -> commands.Amend:
+        """Return what the supervisor can change of an instance, and refuse the rest."""
+        instance, amendment = command.instance, command.amendment
+        if amendment.limits is None or self._client.amends_limits:
+            return command
+        recorded = events.AmendmentRecorded(instance, amendment, _OF_EARLIER_VERSION)
+        self._post(partial(self._take, recorded))
+        return replace(command, amendment=replace(amendment, limits=None))
 
     def _log_waits(self) -> None:
         waits = self._client.waits
@@ -194,7 +209,7 @@ class SupervisorLink:
         self._take(events.SupervisorReported(statuses))
         for one in received:
             if isinstance(one, Amended):
-                self._take(events.RestartPolicyRecorded(one.instance, one.restart))
+                self._take(events.AmendmentRecorded(one.instance, one.amendment, one.refusal))
 
     def take_over(self) -> int:
         """Re-adopt the supervisor's instances, and return their number; no others run."""
@@ -252,9 +267,9 @@ def _order_of(command: commands.Command) -> messages.Order:
             return orders.ContactReported(at, alive)
         case commands.Fail(instance, pid, reason, kill):
             return orders.FailOrdered(key_of(instance), pid, reason, kill)
-        case commands.Amend(instance, restart):
-            amended = orders.AmendOrdered(key_of(instance), restart_rule(restart))
-            return messages.Amend(amended, {SHADOW: None})
+        case commands.Amend(instance, amendment):
+            restart, limits = restart_rule(amendment.restart), run_limits(amendment.limits)
+            return messages.Amend(key_of(instance), restart, {SHADOW: None}, limits)
         case commands.Remember(instance, memo):
             return messages.Remember(key_of(instance), to_memo(memo))
         case commands.Forget(instances):

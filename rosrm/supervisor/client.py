@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.errors import SupervisorError
-from rosrm.model.values import InstanceId, InstanceStatus, RestartPolicy
+from rosrm.model.values import InstanceId, InstanceStatus
 from rosrm.supervisor import json_lines, messages, paths
 from rosrm.supervisor.client_values import (
     Amended,
     LaunchOrder,
     SupervisorMessage,
+    amendment_from,
     fence_rule,
     key_of,
     restart_rule,
@@ -77,6 +78,8 @@ class SupervisorClient:
         unenforced: limit or scheduling setting to the reason why it cannot be enforced here.
         groups: version, directory and controllers of each tree of the instances' control groups.
         reads_secrets: it reads the secrets of instances; one of an earlier version does not.
+        amends_limits: it can change the limits of a running instance; one of an earlier version
+            cannot.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -97,7 +100,7 @@ class SupervisorClient:
         self.fenced: frozenset[InstanceId] = frozenset()
         self.unenforced: Mapping[str, str] = {}
         self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
-        self.reads_secrets = False
+        self.reads_secrets = self.amends_limits = False
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -267,8 +270,8 @@ class SupervisorClient:
             self._received.append(status_from(fields["status"]))
         elif kind == "amended":
             instance = InstanceId(*messages.read_key(fields["instance"]))
-            rule = messages.read_restart(fields["restart"])  # type: ignore[arg-type]
-            self._received.append(Amended(instance, RestartPolicy(*rule)))
+            refusal = messages.read_text(fields.get("refusal", ""))
+            self._received.append(Amended(instance, amendment_from(fields), refusal))
         elif kind == "welcome":
             self._take_welcome(fields)
         elif kind == "refused":
@@ -295,6 +298,7 @@ class SupervisorClient:
         self.fenced = frozenset(InstanceId(*messages.read_key(key)) for key in fenced)
         self.unenforced = messages.read_texts(fields.get("unenforced", _NOTHING_ENFORCED))
         self.reads_secrets = bool(fields.get("secrets", False))
+        self.amends_limits = bool(fields.get("amends", False))
         groups: Any = fields.get("groups", ())
         self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
-from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import (
+    FenceRule,
+    LimitRule,
+    RestartRule,
+    RunLimits,
+    StopRule,
+)
 from rosrm.model.values import (
     EMPTY,
+    Amendment,
+    Enforcement,
     Fence,
     InstanceId,
     InstanceState,
     InstanceStatus,
+    Limits,
     ProcessSpec,
     RestartPolicy,
     StopPolicy,
@@ -49,10 +59,15 @@ class LaunchOrder:
 
 @dataclass(frozen=True, slots=True)
 class Amended:
-    """The supervisor has recorded a new restart policy of an instance."""
+    """The supervisor has recorded an amendment of an instance, or has refused it.
+
+    Attributes:
+        refusal: why nothing has changed; "": it has.
+    """
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
+    refusal: str = ""
 
 
 #: Messages of the supervisor about an instance.
@@ -86,6 +101,24 @@ def limit_rule(spec: ProcessSpec) -> LimitRule:
         limits.memory, limits.memory_high, limits.cpu, spec.cpus, realtime.policy,
         realtime.priority, spec.nice, limits.enforce == "required",
     )  # fmt: skip
+
+
+def run_limits(limits: Limits | None) -> RunLimits | None:
+    """Return limits as the supervisor's change of a running instance; None: none."""
+    if limits is None:
+        return None
+    required = limits.enforce == "required"
+    return RunLimits(limits.memory, limits.memory_high, limits.cpu, required)
+
+
+def amendment_from(fields: Mapping[str, Any]) -> Amendment:
+    """Return an amendment from the supervisor's message about it."""
+    restart = RestartPolicy(*messages.read_restart(fields["restart"]))
+    changed = messages.read_run_limits(fields.get("limits"))
+    if changed is None:
+        return Amendment(restart)
+    enforce: Enforcement = "required" if changed.required else "preferred"
+    return Amendment(restart, Limits(changed.memory, changed.memory_high, changed.cpu, enforce))
 
 
 def status_from(value: object) -> InstanceStatus:

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.supervisor import group_trees
-from rosrm.supervisor.instance_groups import InstanceGroups
+from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
 from rosrm.supervisor.spawn import Scheduler, ScheduleRefused, SpawnError
 from rosrm.wording import by_reason, listed
 
@@ -60,7 +60,7 @@ class Confinement:
             SpawnError: it cannot be started, or its limits are required and cannot be enforced.
         """
         self._check_cpus(limits)
-        wanted = _wanted(limits)
+        wanted = limits.wanted
         faults = {name: self.missing[name] for name in wanted if name in self.missing}
         if limits.nice > 0:  # this needs no rights
             faults.pop("nice", None)
@@ -75,6 +75,19 @@ class Confinement:
         enforced = tuple(name for name in wanted if name not in faults and name not in own)
         return Confined(pid, enforced, by_reason(own.items()))
 
+    def change(self, key: Key, former: LimitRule, limits: LimitRule) -> tuple[str, ...]:
+        """Change the limits of an instance that runs; return the names of those that hold.
+
+        Raises:
+            LimitRefused: one of them cannot be changed, or is required and cannot be enforced
+                here; all are as before.
+        """
+        lacking = {name: why for name, why in self.missing.items() if name in limits.given_limits}
+        if limits.required and lacking:
+            raise LimitRefused(_lacks(lacking))
+        held = self.groups.change(key, former, limits)
+        return tuple(name for name in held if name not in self.missing)
+
     def _check_cpus(self, limits: LimitRule) -> None:
         lacking = sorted(set(limits.cpus) - self._cpus)
         if lacking:
@@ -83,7 +96,7 @@ class Confinement:
     def _make_group(self, key: Key, limits: LimitRule) -> dict[str, str]:
         """Make the group of an instance; return its limits that do not hold, with the reasons."""
         made = self.groups.make(key, limits, realtime=bool(limits.policy))
-        wanted = _wanted(limits)
+        wanted = limits.wanted
         faults = {name: fault for name, fault in made.items() if name in wanted}
         _check_required(limits, faults)
         return faults
@@ -116,7 +129,7 @@ class Confinement:
                 fault = f"its control group cannot be entered: {error.strerror}"
                 # A supervisor beside this one may have removed the group, because it was empty.
                 faults = self._make_group(key, limits)
-        faults = {name: fault for name in _wanted(limits) if name.startswith("limits.")}
+        faults = {name: fault for name in limits.wanted if name.startswith("limits.")}
         _check_required(limits, faults)
         self.groups.remove(key, 0.0)
         return spawn(NO_GROUP, scheduler), faults
@@ -127,21 +140,13 @@ def cpus_in_words(numbers: list[int]) -> str:
     return f"CPU{'s' if len(numbers) > 1 else ''} {listed(map(str, numbers))}"
 
 
-def _wanted(limits: LimitRule) -> tuple[str, ...]:
-    """Return the names of the limits and scheduling settings that are given."""
-    given = {
-        "limits.memory": limits.memory, "limits.memory_high": limits.memory_high,
-        "limits.cpu": limits.cpu, "cpus": limits.cpus, "realtime": limits.policy,
-        "nice": limits.nice,
-    }  # fmt: skip
-    return tuple(name for name, value in given.items() if value)
-
-
 def _check_required(limits: LimitRule, faults: dict[str, str]) -> None:
     if limits.required and faults:
-        raise SpawnError(
-            f"its limits are required, and this host cannot enforce {by_reason(faults.items())}"
-        )
+        raise SpawnError(_lacks(faults))
+
+
+def _lacks(faults: dict[str, str]) -> str:
+    return f"its limits are required, and this host cannot enforce {by_reason(faults.items())}"
 
 
 @contextlib.contextmanager

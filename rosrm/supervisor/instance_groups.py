@@ -32,6 +32,10 @@ _LINKS: Final = 2
 _NO_LIMIT: Final = 2**62
 
 
+class LimitRefused(Exception):
+    """A limit of a running instance cannot be changed; its message says why."""
+
+
 class InstanceGroups:
     """The control groups of one supervisor's instances.
 
@@ -93,6 +97,25 @@ class InstanceGroups:
         self._made[key] = tuple(made)
         self._kills_before[key] = self._kills(key)
         return faults
+
+    def change(self, key: Key, former: LimitRule, limits: LimitRule) -> list[str]:
+        """Change the limits of an instance that runs; return the names of those that hold.
+
+        Raises:
+            LimitRefused: one of them cannot be changed; all are as before.
+        """
+        trees, done = self._made.get(key, ()), list[Tree]()
+        for tree in trees:
+            path = _path(tree, key)
+            done.append(tree)
+            fault = _above(path, tree, limits) if limits.memory != former.memory else ""
+            faults = [fault] if fault else _set_limits(path, tree, limits, former).values()
+            for fault in faults:
+                for changed in done:
+                    _set_limits(_path(changed, key), changed, former, limits)
+                raise LimitRefused(fault)
+        known = {name for tree in trees for name in tree.controllers}
+        return [name for name in limits.given_limits if _CONTROLLER[name] in known]
 
     @contextlib.contextmanager
     def inside(self, key: Key) -> Iterator[int]:
@@ -185,12 +208,7 @@ class InstanceGroups:
         if tree is None:
             return 0
         name = "memory.oom_control" if tree.version == 1 else "memory.events"
-        try:
-            lines = cgroups.read(os.path.join(_path(tree, key), name)).splitlines()
-        except OSError:
-            return 0
-        counts = dict(line.split() for line in lines)
-        return int(counts.get("oom_kill", 0))
+        return _counts(os.path.join(_path(tree, key), name)).get("oom_kill", 0)
 
 
 def remove_empty(group: str) -> None:
@@ -238,25 +256,40 @@ _CONTROLLER: Final = {
 }  # fmt: skip
 _MEMORY: Final = {1: "memory.limit_in_bytes", 2: "memory.max"}
 _PEAK: Final = {1: "memory.max_usage_in_bytes", 2: "memory.peak"}
+_UNLIMITED: Final = LimitRule()
 
 
-def limit_files(version: int, limits: LimitRule) -> Iterator[tuple[str, str, str]]:
-    """Yield name of the limit, control file and content, in the order of writing."""
-    if limits.memory:
-        for file, content in cgroups.memory_files(version, int(limits.memory)):
+def limit_files(
+    version: int, limits: LimitRule, former: LimitRule = _UNLIMITED
+) -> Iterator[tuple[str, str, str]]:
+    """Yield name of the limit, control file and content, in the order of writing.
+
+    Args:
+        former: the limits of the group; those that stay are left out.
+    """
+    if limits.memory != former.memory:
+        files = cgroups.memory_files(version, int(limits.memory))
+        # Version 1 refuses a limit of memory above that of memory and swap.
+        raised = former.memory and not 0 < limits.memory < former.memory
+        for file, content in reversed(files) if raised else files:
             yield "limits.memory", file, content
-    if limits.memory and version == 2:  # the instance ends as a whole, and is reported
-        yield "limits.memory", "memory.oom.group", "1"
-    if limits.memory_high and version == 2:
-        yield "limits.memory_high", "memory.high", str(int(limits.memory_high))
-    if limits.cpu:
-        for file, content in cgroups.cpu_files(version, limits.cpu):
+        if version == 2:  # the instance ends as a whole, and is reported
+            yield "limits.memory", "memory.oom.group", str(int(limits.memory > 0))
+    if limits.memory_high != former.memory_high and version == 2:
+        high = str(int(limits.memory_high)) if limits.memory_high else "max"
+        yield "limits.memory_high", "memory.high", high
+    if limits.cpu != former.cpu:
+        # Version 1 checks period and quota one after the other, against the group above.
+        files = cgroups.cpu_files(version, 0.0) if former.cpu and version == 1 else []
+        for file, content in (*files, *cgroups.cpu_files(version, limits.cpu)):
             yield "limits.cpu", file, content
 
 
-def _set_limits(path: str, tree: Tree, limits: LimitRule) -> dict[str, str]:
-    faults = {}
-    for name, file, content in limit_files(tree.version, limits):
+def _set_limits(
+    path: str, tree: Tree, limits: LimitRule, former: LimitRule = _UNLIMITED
+) -> dict[str, str]:
+    faults: dict[str, str] = {}
+    for name, file, content in limit_files(tree.version, limits, former):
         if _CONTROLLER[name] not in tree.controllers:
             continue
         try:
@@ -267,15 +300,32 @@ def _set_limits(path: str, tree: Tree, limits: LimitRule) -> dict[str, str]:
             # Version 1 refuses a share above that of a group above, which then is the limit.
             if error.errno == errno.EINVAL and file == "cpu.cfs_quota_us":
                 continue
-            faults[name] = _why(path, file, error, limits)
+            faults.setdefault(name, _why(path, file, error, limits))
     return faults
 
 
 def _why(path: str, file: str, error: OSError, limits: LimitRule) -> str:
-    if error.errno == errno.EBUSY:  # of a former run, which the kernel has not given back
-        used = size(_number(os.path.join(path, "memory.usage_in_bytes")))
-        return f"its control group uses {used} already, and the limit is {size(limits.memory)}"
+    if error.errno == errno.EBUSY:  # of a former run, if the kernel has not given it back
+        return _uses(_number(os.path.join(path, "memory.usage_in_bytes")), limits)
     return f"{file} of the control group {path} cannot be written: {error.strerror}"
+
+
+def _uses(used: float, limits: LimitRule) -> str:
+    return f"its control group uses {size(used)} already, and the limit is {size(limits.memory)}"
+
+
+def _above(path: str, tree: Tree, limits: LimitRule) -> str:
+    """Return why a limit of memory would kill the processes of a group of version 2; "": not.
+
+    Version 1 refuses such a limit, version 2 obeys it.
+    """
+    if not limits.memory or tree.version == 1 or "memory" not in tree.controllers:
+        return ""
+    used = _number(os.path.join(path, "memory.current"))
+    if used > limits.memory:
+        pages = _counts(os.path.join(path, "memory.stat"))
+        used -= sum(pages.get(name, 0) for name in ("active_file", "inactive_file"))
+    return _uses(used, limits) if used > limits.memory else ""
 
 
 def _make(path: str, tree: Tree) -> None:
@@ -314,6 +364,15 @@ def _number(path: str) -> float:
     except OSError:
         return 0.0
     return float(text) if text.isdigit() and int(text) < _NO_LIMIT else 0.0
+
+
+def _counts(path: str) -> dict[str, int]:
+    """Return the counts in a control file by name; {}: it cannot be read."""
+    try:
+        lines = cgroups.read(path).splitlines()
+    except OSError:
+        return {}
+    return {name: int(count) for name, count in map(str.split, lines)}
 
 
 def _folders(path: str) -> set[str]:

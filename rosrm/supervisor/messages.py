@@ -33,15 +33,17 @@ The client sends orders; the key `do` names the order:
     restart      instance                       stop, then start again
     fail         instance, pid, reason, kill    count this run as failed: stop it (kill: at once by
                                                 SIGKILL), then apply the restart policy
-    amend        instance, restart, changes     replace the restart policy, and apply these changes
-                                                on top of the earlier ones at the next start
+    amend        instance, restart, changes,    replace the restart policy, and apply these changes
+                 limits                         on top of the earlier ones at the next start
+                                                limits: null, or the new ones, as the fields of
+                                                `RunLimits`, which hold from now on
     remember     instance, memo                 replace the memo
     forget       instances                      the client has stored their final statuses
     shutdown                                    stop everything, then end
 
 The supervisor sends messages; the key `tell` names the message:
 
-    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets
+    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets, amends
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
@@ -50,8 +52,10 @@ The supervisor sends messages; the key `tell` names the message:
                                                    groups: [version, directory, controllers] where
                                                    the control groups of instances are
                                                    secrets: true, for it reads them at each start
+                                                   amends: true, for it can change limits
     status       status                            a change, or the answer to a repeated order
-    amended      instance, restart                 the amendment is recorded; its status came before
+    amended      instance, restart, limits,        the amendment is recorded; its status came before
+                 refusal                           refusal: "", or why nothing has changed
     refused      message                           the supervisor closes the connection after it
     ended                                          the shutdown is complete; closed after it
 
@@ -68,7 +72,14 @@ from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import Instance
-from rosrm.core.supervisor.rules import FenceRule, Key, LimitRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import (
+    FenceRule,
+    Key,
+    LimitRule,
+    RestartRule,
+    RunLimits,
+    StopRule,
+)
 from rosrm.model.durations import LONGEST
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
@@ -117,16 +128,23 @@ class Launch(NamedTuple):
     secrets: Mapping[str, str] = MappingProxyType({})
 
     def amended(self, amendment: Amend) -> Launch:
-        """Return this launch with the restart policy and environment changes of an amendment."""
+        """Return this launch as it is after an amendment."""
         changes = {**self.changes, **amendment.changes}
-        return self._replace(changes=changes, restart=amendment.order.restart)
+        limits = self.limits.with_limits(amendment.limits)
+        return self._replace(changes=changes, restart=amendment.restart, limits=limits)
 
 
 class Amend(NamedTuple):
-    """A new restart policy, and environment changes for the next start."""
+    """A new restart policy, environment changes for the next start, and new limits.
 
-    order: events.AmendOrdered
+    Attributes:
+        limits: None: they stay.
+    """
+
+    instance: Key
+    restart: RestartRule
     changes: Mapping[str, str | None]
+    limits: RunLimits | None = None
 
 
 class Remember(NamedTuple):
@@ -194,7 +212,7 @@ def encode_order(order: Order) -> bytes:
     elif isinstance(order, Launch):
         fields = launch_fields(order)
     elif isinstance(order, Amend):
-        fields = {**order.order._asdict(), "changes": dict(order.changes)}
+        fields["changes"] = dict(order.changes)
     elif isinstance(order, Forget):
         fields = {"instances": [forgotten.instance for forgotten in order.instances]}
     return line({"do": _KINDS[type(order)], **fields})
@@ -265,8 +283,10 @@ def _read_fail(fields: Mapping[str, Any]) -> events.FailOrdered:
 
 
 def _read_amend(fields: Mapping[str, Any]) -> Amend:
-    order = events.AmendOrdered(read_key(fields["instance"]), read_restart(fields["restart"]))
-    return Amend(order, _changes(fields["changes"]))
+    return Amend(
+        read_key(fields["instance"]), read_restart(fields["restart"]), _changes(fields["changes"]),
+        read_run_limits(fields.get("limits")),  # not sent by clients of an earlier version
+    )  # fmt: skip
 
 
 _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
@@ -338,6 +358,16 @@ def read_limits(value: Sequence[Any]) -> LimitRule:
     )  # fmt: skip
 
 
+def read_run_limits(value: Sequence[Any] | None) -> RunLimits | None:
+    """Return limits that can be changed from their JSON list."""
+    if value is None:
+        return None
+    memory, memory_high, cpu, required = value
+    return RunLimits(
+        read_amount(memory), read_amount(memory_high), read_amount(cpu), bool(required)
+    )
+
+
 def read_text(value: Any) -> str:
     """Return a JSON value that must be a text. Raises TypeError."""
     if not isinstance(value, str):
@@ -407,7 +437,7 @@ def encode_welcome(
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
     return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups,
-                 "secrets": True})  # fmt: skip
+                 "secrets": True, "amends": True})  # fmt: skip
 
 
 def encode_status(status: Status) -> bytes:
@@ -415,9 +445,10 @@ def encode_status(status: Status) -> bytes:
     return line({"tell": "status", "status": status})
 
 
-def encode_amended(order: events.AmendOrdered) -> bytes:
-    """Return the line that confirms a recorded amendment."""
-    return line({"tell": "amended", "instance": order.instance, "restart": order.restart})
+def encode_amended(order: Amend, refusal: str) -> bytes:
+    """Return the line that confirms a recorded amendment, or refuses it."""
+    what = {"instance": order.instance, "restart": order.restart, "limits": order.limits}
+    return line({"tell": "amended", **what, "refusal": refusal})
 
 
 def encode_refusal(message: str) -> bytes:

@@ -36,6 +36,7 @@ from rosrm.supervisor import (
 )
 from rosrm.supervisor.confinement import Confined, Confinement
 from rosrm.supervisor.connection import Connection
+from rosrm.supervisor.instance_groups import LimitRefused
 from rosrm.supervisor.instance_record import InstanceRecord
 from rosrm.supervisor.json_lines import ProtocolError
 from rosrm.supervisor.logs import LogKeeper, LogLimits
@@ -411,11 +412,25 @@ class Server:
         self._happened(newest)
 
     def _amend(self, amendment: messages.Amend) -> None:
-        launch = self._launches.get(amendment.order.instance)
-        if launch is not None:
-            self._keep_launch(launch.amended(amendment))
-        self._happened(amendment.order)
-        self._unsent.append(messages.encode_amended(amendment.order))
+        launch, held, refusal = self._launches.get(amendment.instance), None, ""
+        try:
+            if launch is not None:
+                held = self._change_limits(launch, amendment)
+                self._keep_launch(launch.amended(amendment))
+            self._happened(events.AmendOrdered(amendment.instance, amendment.restart, held))
+        except LimitRefused as refused:
+            refusal = str(refused).replace(self._state, "STATE")
+        self._unsent.append(messages.encode_amended(amendment, refusal))
+
+    def _change_limits(
+        self, launch: messages.Launch, amendment: messages.Amend
+    ) -> tuple[str, ...] | None:
+        """Change the limits of a run; return those that hold, None: nothing runs, or they stay."""
+        limits = launch.limits.with_limits(amendment.limits)
+        runs = self._core.instances[launch.instance].pid
+        if limits == launch.limits or not runs:
+            return None
+        return self._confinement.change(launch.instance, launch.limits, limits)
 
     def _remember(self, order: messages.Remember) -> None:
         launch = self._launches.get(order.instance)

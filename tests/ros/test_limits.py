@@ -9,13 +9,18 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.client.waiting import wait_for_applications
+from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.values import Limits, RestartPolicy
 from rosrm.supervisor import group_trees
 from tests.ros.clusters import STEADY, host, job, python, service
+from tests.waiting import PATIENCE
 
 MB = 1_000_000
 #: Says that it begins, then writes to each page of many bytes.
 LEAK = "print('begun', flush=True); x = bytearray({0}); x[::4096] = b'1' * len(x[::4096])"
+#: Holds many bytes.
+HOLD = "import time; x = b'1' * {0}; time.sleep(1000)"
 #: Shares many bytes with a child, which is a session of its own; both then sleep.
 SHARED = """
 import mmap, os, time
@@ -61,6 +66,26 @@ def test_limits_that_hold_are_listed_and_outlive_slave_and_supervisor(cluster) -
     row = cluster.wait("shares", "running", where=lambda row: row.memory > 50 * MB, **held)
     assert row.restarts == 0
     cluster.cancel("shares")
+
+
+def test_an_application_changes_the_limits_of_a_process_that_runs_on(cluster) -> None:
+    """Limits that it exceeds are refused, and those before them hold on."""
+
+    def apply(**limits: float) -> str:
+        spec = python("holds", HOLD.format(50 * MB), limits=Limits(**limits), application="limits")
+        cluster.client.apply([Target("limits", (spec,), rollout=RolloutPolicy(healthy_for=0.0))])
+        quiet = {"on_change": lambda _: None, "notify": lambda _: None}
+        rows = wait_for_applications(cluster.client, ["limits"], timeout=PATIENCE, **quiet)
+        return "" if rows[0].returned_from is None else rows[0].returned_from.given_up
+
+    assert apply(memory=200 * MB) == ""
+    pid = cluster.wait("holds", "running", where=lambda row: row.memory > 50 * MB).pid
+    assert apply(memory=100 * MB, cpu=0.5) == ""
+    held = {"pid": pid, "memory_limit": 100 * MB, "cpu_limit": 0.5}
+    cluster.wait("holds", "running", **held)
+    assert "and the limit is 20.0 MB" in apply(memory=20 * MB)
+    cluster.wait("holds", "running", **held)
+    cluster.cancel("holds")
 
 
 def test_a_host_that_lacks_a_cpu_takes_no_process_that_requires_it(cluster) -> None:

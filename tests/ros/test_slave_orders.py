@@ -35,7 +35,7 @@ class Orders:
         """Order another restart policy; return the answer."""
         request = srv.ControlHost.Request(
             envelope=self._master.control.envelope(time.monotonic_ns(), 1 << 40),
-            action=srv.ControlHost.Request.SET_RESTART,
+            action=srv.ControlHost.Request.AMEND,
             instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
         )  # fmt: skip
         return self._master.ask(srv.ControlHost, path.of_host("h0", names.CONTROL), request).answer
@@ -86,7 +86,7 @@ def test_a_policy_for_a_process_of_a_killed_slave(cluster, orders) -> None:
 def test_a_policy_for_an_unknown_instance_is_refused(orders) -> None:
     """The refusal has a code for programs and a reason for users."""
     answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
-    assert (answer.accepted, answer.code) == (False, "unknown")
+    assert (answer.accepted, answer.code) == (False, "not_amended")
     assert "nobody#99 is not known here" in answer.message
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import reloading, start_order
-from rosrm.core.master.applications import restart_policies
+from rosrm.core.master.applications import amendments
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.master_state import MasterState
@@ -13,12 +13,12 @@ from rosrm.core.master.state.pending_orders import (
     CapabilityQuery,
     DependencyRestart,
     ImageRemoval,
+    InstanceAmendment,
     LinkMeasurement,
     MigrationStep,
     PeriodicCheckpoint,
     Reload,
     Replication,
-    RestartPolicyChange,
 )
 
 
@@ -30,8 +30,8 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             return
         case MigrationStep(process):
             steps.note_answer(state, process, event)
-        case RestartPolicyChange():
-            restart_policies.note_answer(state, purpose, event)
+        case InstanceAmendment():
+            amendments.note_answer(state, purpose, event)
         case Replication(process):
             replication.note_answer(state, process, event)
         case CapabilityQuery():

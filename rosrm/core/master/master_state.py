@@ -109,7 +109,7 @@ class MasterState:
         applications: by name.
         modes: sets of applications, and the one in force.
         terminal: names of the terminal processes, in the order in which they ended.
-        unamended: name of each process whose slave does not know its new restart policy yet, to the
+        unamended: name of each process whose slave has not changed the running instance yet, to the
             time of the last order.
         ended_members: principal and name of each group that has to end, because one of its
             processes has ended in this step, to the first such process.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.applications import restart_policies, rollout
+from rosrm.core.master.applications import amendments, rollout
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
 from rosrm.core.master.assignment.reservations import review_reservation
@@ -46,7 +46,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     state.reviewed = now
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
-    restart_policies.review(state, now)
+    amendments.review(state, now)
     rollout.review(state, now)
     switching.review(state, now)
     review_time_limits(state, now)

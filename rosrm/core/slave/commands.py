@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rosrm.core.slave.watches import Memo
-from rosrm.model.values import Assignment, InstanceId, InstanceStatus, RestartPolicy
+from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,18 +68,18 @@ class Fail:
 
 @dataclass(frozen=True, slots=True)
 class Amend:
-    """Order the supervisor to replace a restart policy; `RestartPolicyRecorded` follows."""
+    """Order the supervisor to change an instance; `AmendmentRecorded` follows."""
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
 
 
 @dataclass(frozen=True, slots=True)
 class Settle:
-    """Answer the order to set a restart policy; `refusal`: why that failed; "": success."""
+    """Answer the order to change an instance; `refusal`: why that failed; "": success."""
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
     refusal: str = ""
 
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rosrm.core.slave.watches import Memo, Observation
-from rosrm.model.values import Assignment, InstanceId, InstanceStatus, RestartPolicy
+from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,19 +87,24 @@ class RestartOrdered:
 
 
 @dataclass(frozen=True, slots=True)
-class RestartPolicySet:
-    """The master replaced the restart policy of an instance, which is no shadow from then on."""
+class AmendmentOrdered:
+    """The master ordered to change an instance, which is no shadow from then on."""
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
 
 
 @dataclass(frozen=True, slots=True)
-class RestartPolicyRecorded:
-    """The supervisor has recorded the restart policy of an instance."""
+class AmendmentRecorded:
+    """The supervisor has recorded an amendment of an instance, or has refused it.
+
+    Attributes:
+        refusal: why nothing has changed; "": it has.
+    """
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
+    refusal: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,8 +180,8 @@ Event = (
     | FenceOrdered
     | ContactConfirmed
     | RestartOrdered
-    | RestartPolicySet
-    | RestartPolicyRecorded
+    | AmendmentOrdered
+    | AmendmentRecorded
     | ReportRequested
     | SupervisorReported
     | SupervisorReplaced

@@ -17,6 +17,7 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    RestartPolicy,
     qualified_name,
 )
 
@@ -188,24 +189,29 @@ def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float
     return [commands.Restart(event.instance)]
 
 
-def _restart_policy_set(state: SlaveState, event: events.RestartPolicySet, now: float) -> _Commands:
-    held = state.held.get(event.instance)
+def _amendment_ordered(state: SlaveState, event: events.AmendmentOrdered, now: float) -> _Commands:
+    instance, amendment = event.instance, event.amendment
+    held = state.held.get(instance)
     if held is None:
         return [_unknown(event)]
+    settled: _Commands = [
+        commands.Report((held.status,)), commands.Settle(instance, amendment)
+    ]  # fmt: skip
     if held.status.state.ended:
-        return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
-    news = _pause_or_watch(held, event)
-    waiting = state.waiting.get(event.instance)
+        return settled
+    news = _pause_or_watch(held, amendment.restart)
+    waiting = state.waiting.get(instance)
     if waiting is not None:  # the supervisor does not know the instance yet
-        spec = replace(waiting.spec, restart=event.restart)
-        state.waiting[event.instance] = replace(waiting, spec=spec, shadow=False)
-        return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
-    held.unsettled += (event.restart,)
-    remember = [commands.Remember(event.instance, held.memo)] if news else []
-    return [commands.Amend(event.instance, event.restart), *remember]
+        limits = waiting.spec.limits if amendment.limits is None else amendment.limits
+        spec = replace(waiting.spec, restart=amendment.restart, limits=limits)
+        state.waiting[instance] = replace(waiting, spec=spec, shadow=False)
+        return settled
+    held.unsettled += (amendment,)
+    remember = [commands.Remember(instance, held.memo)] if news else []
+    return [commands.Amend(instance, amendment), *remember]
 
 
-def _pause_or_watch(held: HeldInstance, order: events.RestartPolicySet) -> bool:
+def _pause_or_watch(held: HeldInstance, restart: RestartPolicy) -> bool:
     """Pause or resume the health checks by the restart policy; return True if that changed.
 
     A migration turns restarts off and on again. The checks of an instance without restarts cannot
@@ -214,27 +220,28 @@ def _pause_or_watch(held: HeldInstance, order: events.RestartPolicySet) -> bool:
     watch = held.watch
     if watch is None:
         return False
-    paused = watch.restarts and order.restart.when == "never"
+    paused = watch.restarts and restart.when == "never"
     held.watch = replace(watch, paused=paused)
     held.judgement = None
     return paused != watch.paused
 
 
-def _unknown(order: events.RestartPolicySet) -> commands.Settle:
+def _unknown(order: events.AmendmentOrdered) -> commands.Settle:
     never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
-    return commands.Settle(order.instance, order.restart, never)
+    return commands.Settle(order.instance, order.amendment, never)
 
 
-def _restart_policy_recorded(
-    state: SlaveState, event: events.RestartPolicyRecorded, now: float
+def _amendment_recorded(
+    state: SlaveState, event: events.AmendmentRecorded, now: float
 ) -> _Commands:
+    settled = commands.Settle(event.instance, event.amendment, event.refusal)
     held = state.held.get(event.instance)
     if held is None:
-        return [commands.Settle(event.instance, event.restart)]
-    if event.restart in held.unsettled:
-        at = held.unsettled.index(event.restart)
+        return [settled]
+    if event.amendment in held.unsettled:
+        at = held.unsettled.index(event.amendment)
         held.unsettled = held.unsettled[:at] + held.unsettled[at + 1 :]
-    return [commands.Report((held.status,)), commands.Settle(event.instance, event.restart)]
+    return [commands.Report((held.status,)), settled]
 
 
 def _report_requested(state: SlaveState, event: events.ReportRequested, now: float) -> _Commands:
@@ -265,8 +272,8 @@ def _supervisor_replaced(
             _bury(state, instance)
         held.judgement = None  # judge again, because the order to fail the run may be lost
         again += [
-            _amend_again(events.RestartPolicySet(instance, restart), held, lost=lost)
-            for restart in held.unsettled
+            _amend_again(events.AmendmentOrdered(instance, amendment), held, lost=lost)
+            for amendment in held.unsettled
         ]
     for status in event.statuses:
         _follow(state, status, now, event.memos.get(status.instance))
@@ -279,12 +286,12 @@ def _supervisor_replaced(
 
 
 def _amend_again(
-    order: events.RestartPolicySet, held: HeldInstance, *, lost: bool
+    order: events.AmendmentOrdered, held: HeldInstance, *, lost: bool
 ) -> commands.Command:
     """Return the command that repeats an order, because the former supervisor may have lost it."""
     if held.status.state.ended:
-        return commands.Settle(order.instance, order.restart)
-    return _unknown(order) if lost else commands.Amend(order.instance, order.restart)
+        return commands.Settle(order.instance, order.amendment)
+    return _unknown(order) if lost else commands.Amend(order.instance, order.amendment)
 
 
 def _follow(
@@ -302,8 +309,11 @@ def _follow(
             held.status = _running(held, reported, now)
     elif reported.state is InstanceState.RUNNING:
         if held.status.state is InstanceState.READY and held.status.pid == reported.pid:
-            return None
-        held.status = _running(held, reported, now)
+            if held.status.enforced == reported.enforced:
+                return None
+            held.status = replace(held.status, enforced=reported.enforced)
+        else:
+            held.status = _running(held, reported, now)
     else:
         held.ready_by = None
         held.status = _with_unready(held, reported)
@@ -410,8 +420,8 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.FenceOrdered: _end_ordered,
         events.ContactConfirmed: fencing.contact_confirmed,
         events.RestartOrdered: _restart_ordered,
-        events.RestartPolicySet: _restart_policy_set,
-        events.RestartPolicyRecorded: _restart_policy_recorded,
+        events.AmendmentOrdered: _amendment_ordered,
+        events.AmendmentRecorded: _amendment_recorded,
         events.ReportRequested: _report_requested,
         events.SupervisorReported: _supervisor_reported,
         events.SupervisorReplaced: _supervisor_replaced,

@@ -20,7 +20,7 @@ def event_of(order: orders.InstanceOrder, given_at: float | None = None) -> even
             return events.FenceOrdered(instance)
         case orders.RestartInstance(instance):
             return events.RestartOrdered(instance)
-        case orders.SetRestartPolicy(instance, restart):
-            return events.RestartPolicySet(instance, restart)
+        case orders.AmendInstance(instance, amendment):
+            return events.AmendmentOrdered(instance, amendment)
         case orders.ReportInstances():
             return events.ReportRequested()

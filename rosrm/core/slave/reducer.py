@@ -14,9 +14,9 @@ StopOrdered             stops the instance; an unknown instance will never be st
 FenceOrdered            kills the instance; an unknown instance will never be started
 ContactConfirmed        sends the last contact to the supervisor, if a live instance has a fence
 RestartOrdered          stops the instance, and starts it again on this host
-RestartPolicySet        orders the supervisor to record the policy; answers at once for an instance
-                        that waits, has ended or is unknown
-RestartPolicyRecorded   answers the order
+AmendmentOrdered        orders the supervisor to change the instance; answers at once for one that
+                        waits, has ended or is unknown
+AmendmentRecorded       answers the order
 ReportRequested         reports all instances
 SupervisorReported      updates the statuses; a new run must become ready again
 SupervisorReplaced      the same; drops the instances that the new supervisor does not know,

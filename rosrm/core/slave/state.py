@@ -16,12 +16,12 @@ from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import (
     RESOURCE_SLOTS,
+    Amendment,
     Assignment,
     InstanceId,
     InstanceState,
     InstanceStatus,
     ProcessSpec,
-    RestartPolicy,
 )
 
 _SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
@@ -40,8 +40,8 @@ class HeldInstance:
         judgement: health of the watched run; None: not watched, or not observed yet.
         fenced: it has a fence.
         unready: why it was stopped, if it did not become ready in time; "": it did.
-        unsettled: restart policies that the master has set and the supervisor has not recorded
-            yet, in order.
+        unsettled: amendments that the master has ordered and the supervisor has not recorded yet,
+            in order.
         ended_at: time of its end, or of the report of the end to a newly registered master.
         devices: devices that it holds.
         artifacts: artifacts that it uses.
@@ -55,7 +55,7 @@ class HeldInstance:
     judgement: InstanceHealth | None = None
     fenced: bool = False
     unready: str = ""
-    unsettled: tuple[RestartPolicy, ...] = ()
+    unsettled: tuple[Amendment, ...] = ()
     ended_at: float = 0.0
     devices: tuple[HeldDevice, ...] = ()
     artifacts: tuple[Artifact, ...] = ()

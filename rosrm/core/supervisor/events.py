@@ -54,10 +54,15 @@ class RestartOrdered(NamedTuple):
 
 
 class AmendOrdered(NamedTuple):
-    """The client set another restart policy for the instance."""
+    """The client set another restart policy for the instance, and perhaps other limits.
+
+    Attributes:
+        held: names of the limits that hold from now on; None: those that held before.
+    """
 
     instance: Key
     restart: RestartRule
+    held: tuple[str, ...] | None = None
 
 
 class FailOrdered(NamedTuple):

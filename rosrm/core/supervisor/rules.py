@@ -26,6 +26,15 @@ class StopRule(NamedTuple):
     terminate_grace: float = 5.0
 
 
+class RunLimits(NamedTuple):
+    """Limits that can be changed while an instance runs; the fields are those of `LimitRule`."""
+
+    memory: float
+    memory_high: float
+    cpu: float
+    required: bool
+
+
 class LimitRule(NamedTuple):
     """Limits and scheduling of an instance; 0, (), "": none.
 
@@ -47,6 +56,25 @@ class LimitRule(NamedTuple):
     priority: int = 0
     nice: int = 0
     required: bool = False
+
+    @property
+    def given_limits(self) -> tuple[str, ...]:
+        """Return the names of the limits that are given."""
+        given = {
+            "limits.memory": self.memory, "limits.memory_high": self.memory_high,
+            "limits.cpu": self.cpu,
+        }  # fmt: skip
+        return tuple(name for name, value in given.items() if value)
+
+    @property
+    def wanted(self) -> tuple[str, ...]:
+        """Return the names of the limits and of the scheduling settings that are given."""
+        given = {"cpus": self.cpus, "realtime": self.policy, "nice": self.nice}
+        return (*self.given_limits, *(name for name, value in given.items() if value))
+
+    def with_limits(self, limits: RunLimits | None) -> LimitRule:
+        """Return this rule with other limits; None: the same."""
+        return self if limits is None else self._replace(**limits._asdict())
 
 
 class FenceRule(NamedTuple):

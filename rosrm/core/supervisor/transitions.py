@@ -202,10 +202,13 @@ def _fence_in_backoff(instance: Instance, event: events.Event, now: float) -> li
 
 def _amend(instance: Instance, event: events.Event, now: float) -> list[Command]:
     assert isinstance(event, events.AmendOrdered)
-    if instance.restart == event.restart:
-        return []
+    before = instance.restart, instance.enforced
     instance.restart = event.restart
-    return [ReportStatus(instance.key)]
+    if event.held is not None:
+        others = [name for name in instance.enforced if not name.startswith("limits.")]
+        instance.enforced = (*event.held, *others)
+    changed = before != (instance.restart, instance.enforced)
+    return [ReportStatus(instance.key)] if changed else []
 
 
 def _amend_in_backoff(instance: Instance, event: events.Event, now: float) -> list[Command]:

@@ -13,12 +13,13 @@ from rosrm.errors import Refused
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
 from rosrm.model.orders import (
+    NOT_AMENDED,
+    AmendInstance,
     DropReplica,
     MeasureLinks,
     ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
-    SetRestartPolicy,
 )
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
@@ -68,9 +69,8 @@ class Duties:
 
     Attributes:
         take: takes an event for the core.
-        set_restart: replaces the restart policy of an instance. It calls its last argument with ""
-            when the policy is durable, whichever process is killed, else with the reason why there
-            is no such instance.
+        amend: changes an instance that runs on. It calls its last argument with "" when the change
+            is durable, whichever process is killed, else with the reason why nothing has changed.
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
         drop_snapshots: deletes the snapshots of a process, of instances up to this one.
         execute: runs an executor, and calls its last argument with the outcome. If that takes
@@ -82,7 +82,7 @@ class Duties:
     """
 
     take: Callable[[Event], None]
-    set_restart: Callable[[SetRestartPolicy, Callable[[str], None]], None]
+    amend: Callable[[AmendInstance, Callable[[str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
@@ -113,15 +113,15 @@ class SlaveServices:
         self, request: srv.ControlHost.Request, _sealed: SealedRequest,
         respond: Callable[[Any], None],
     ) -> None:  # fmt: skip
-        """Carry out an order; the outcomes of executors and restart policies come later."""
+        """Carry out an order; the outcomes of executors and amendments come later."""
         try:
             order = order_from_msg(request)
             match order:
                 case RunExecutor():
                     self._execute(order, respond)
                     return
-                case SetRestartPolicy():
-                    self._set_restart(order, respond)
+                case AmendInstance():
+                    self._amend(order, respond)
                     return
                 case MeasureLinks():
                     self._measure_links(order, respond)
@@ -140,12 +140,12 @@ class SlaveServices:
             return
         respond(srv.ControlHost.Response(answer=accepted()))
 
-    def _set_restart(self, order: SetRestartPolicy, respond: Callable[[Any], None]) -> None:
+    def _amend(self, order: AmendInstance, respond: Callable[[Any], None]) -> None:
         def settled(refusal: str) -> None:
-            answer = refused("unknown", refusal) if refusal else accepted()
+            answer = refused(NOT_AMENDED, refusal) if refusal else accepted()
             respond(srv.ControlHost.Response(answer=answer))
 
-        self._duties.set_restart(order, settled)
+        self._duties.amend(order, settled)
 
     def _measure_links(self, order: MeasureLinks, respond: Callable[[Any], None]) -> None:
         def done(report: LinkReport) -> None:

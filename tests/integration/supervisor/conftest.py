@@ -12,11 +12,17 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.core.supervisor.events import AmendOrdered
-from rosrm.model.values import InstanceId, InstanceState, RestartPolicy, StopPolicy
+from rosrm.model.values import (
+    Amendment,
+    InstanceId,
+    InstanceState,
+    Limits,
+    RestartPolicy,
+    StopPolicy,
+)
 from rosrm.supervisor import instance_record, procfs
 from rosrm.supervisor.client import SupervisorClient, log_path
-from rosrm.supervisor.client_values import Amended, LaunchOrder, key_of, restart_rule
+from rosrm.supervisor.client_values import Amended, LaunchOrder, key_of, restart_rule, run_limits
 from rosrm.supervisor.messages import Amend
 from tests.waiting import PATIENCE, command_of, wait_gone
 
@@ -90,14 +96,20 @@ class Host:
         found = next(one for one in client.instances if one.instance.process == name)
         return found if found.state.ended else self.ended(client, name)
 
-    def amend(self, client, name: str, restart: RestartPolicy) -> None:
-        """Change the restart policy as the slave does; wait for the supervisor's record."""
+    def amend(self, client, name: str, restart: RestartPolicy, limits: Limits | None = None) -> str:
+        """Change an instance as the slave does; return why the supervisor refused, "": it did not.
+
+        Waits for the supervisor's record.
+        """
         instance, deadline = InstanceId(name, 1), time.monotonic() + PATIENCE
-        order = AmendOrdered(key_of(instance), restart_rule(restart))
-        client.send(Amend(order, {"ROSRM_SHADOW": None}))
-        amended = Amended(instance, restart)
-        while amended not in client.receive(max(0.0, deadline - time.monotonic())):
-            assert time.monotonic() < deadline, f"{amended} was not reported within {PATIENCE} s"
+        rules = restart_rule(restart), {"ROSRM_SHADOW": None}, run_limits(limits)
+        client.send(Amend(key_of(instance), *rules))
+        amendment = Amendment(restart, limits)
+        while time.monotonic() < deadline:
+            for one in client.receive(max(0.0, deadline - time.monotonic())):
+                if isinstance(one, Amended) and one.amendment == amendment:
+                    return one.refusal
+        raise AssertionError(f"{amendment} was not reported within {PATIENCE} s")
 
     def kill_supervisor(self, client) -> None:
         kill(client.pid)

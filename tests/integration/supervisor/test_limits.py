@@ -11,17 +11,21 @@ from threading import Event
 import pytest
 
 from rosrm.core.supervisor.rules import LimitRule
-from rosrm.model.values import InstanceState, RestartPolicy
+from rosrm.model.values import InstanceState, Limits, RestartPolicy
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.client import SupervisorClient
 from rosrm.supervisor.instance_groups import pids, remove_empty
 from tests.waiting import PATIENCE, wait_gone, wait_until
+
+from .conftest import kill
 
 MB = 1_000_000
 #: Says that it begins, then writes to each page of many bytes.
 HOG = (
     "import sys; print('begun', flush=True); x = bytearray({0}); x[::4096] = b'1' * len(x[::4096])"
 )
+#: Says when it holds many bytes of memory, and sleeps.
+HOLD = "import time; x = b'1' * {0}; print('holds', flush=True); time.sleep(1000)"
 #: Starts a daemon with a session of its own and without environment, and says its pid.
 DAEMON = """
 import os, time
@@ -94,6 +98,64 @@ def test_a_process_beyond_its_cpu_limit_waits(host, client) -> None:
     wait_until(
         lambda: "nr_throttled 0\n" not in statistics.read_text(), "the pause of a busy process"
     )
+
+
+def read(client: SupervisorClient, name: str) -> tuple[str, str]:
+    """Return the limits of memory and CPU time that the kernel has of an instance."""
+    memory, cpu = (group_of(client, name, controller) for controller in ("memory", "cpu"))
+    for files in ("memory.limit_in_bytes", "cpu.cfs_quota_us"), ("memory.max", "cpu.max"):
+        if (memory / files[0]).exists():
+            return (memory / files[0]).read_text().strip(), (cpu / files[1]).read_text().strip()
+    raise AssertionError(f"{memory} has no limit")
+
+
+def test_limits_change_while_a_process_runs(host, client) -> None:
+    """They are raised, lowered and removed, also by the supervisor that follows a killed one."""
+    unlimited = host.sleeper(client, "unlimited") and read(client, "unlimited")
+    order = host.python("calm", HOLD.format(20 * MB), limits=LimitRule(memory=60 * MB))
+    client.start([order])
+    pid = host.running(client, "calm").pid
+    seen = []
+    for limits in (
+        Limits(memory=100 * MB, cpu=1.5), Limits(memory=50 * MB, cpu=0.03), Limits(cpu=1.0),
+        Limits(),
+    ):  # fmt: skip
+        assert host.amend(client, "calm", ONE_RESTART, limits) == ""
+        seen.append(read(client, "calm"))
+        client = host.replace_supervisor(client)
+        (status,) = (one for one in client.instances if one.pid == pid)
+        given = {"limits.memory": limits.memory, "limits.cpu": limits.cpu}
+        assert status.enforced == tuple(name for name, value in given.items() if value)
+    memory = [int(of_memory) // MB for of_memory, _ in seen[:2]]
+    assert memory == [99, 49]  # in whole pages
+    assert len({of_cpu for _, of_cpu in seen}) == len(seen)
+    assert (seen[2][0], seen[3]) == (unlimited[0], unlimited)
+
+
+def test_a_limit_below_what_a_process_uses_is_refused(host, client) -> None:
+    """Nothing changes, the limits of the next run included."""
+    first = LimitRule(memory=60 * MB, cpu=1.0)
+    client.start([host.python("full", HOLD.format(30 * MB), limits=first, restart=ONE_RESTART)])
+    pid = host.running(client, "full").pid
+    wait_until(lambda: host.log("full").read_text() == "holds\n", "that it holds its memory")
+    before = read(client, "full")
+    refusal = host.amend(client, "full", ONE_RESTART, Limits(memory=10 * MB, cpu=0.5))
+    assert "and the limit is 10.0 MB" in refusal
+    assert read(client, "full") == before
+    kill(pid)
+    host.wait(client, "full", InstanceState.BACKOFF)
+    host.running(client, "full")
+    assert read(client, "full") == before
+
+
+def test_new_limits_hold_for_the_next_run(host, client) -> None:
+    """An instance that waits for its restart has no control group to change."""
+    slow = RestartPolicy("on-failure", delay=0.5)
+    pid = host.sleeper(client, "again", restart=slow)
+    kill(pid)
+    host.wait(client, "again", InstanceState.BACKOFF)
+    assert host.amend(client, "again", slow, Limits(memory=50 * MB)) == ""
+    assert host.running(client, "again").enforced == ("limits.memory",)
 
 
 def test_cpus_scheduling_and_niceness_are_set_before_the_program_runs(host, client) -> None:

@@ -12,11 +12,12 @@ from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Reply
 from rosrm.model.applications import Action, ApplicationRow
 from rosrm.model.arrays import ArrayMembership
-from rosrm.model.orders import SetRestartPolicy, StartInstance
+from rosrm.model.orders import StartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
     InstanceState,
     InstanceStatus,
+    Limits,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
@@ -107,23 +108,43 @@ def test_a_change_of_what_only_the_master_reads_restarts_nothing(changed: dict[s
     assert state_of(cluster) == (2, [])
 
 
-def test_a_restart_policy_changes_in_place() -> None:
-    """The slave gets the new policy for the running instance, also after a restart of the master.
+@pytest.mark.parametrize(
+    "changed",
+    [{"restart": RestartPolicy("always", delay=0.5)}, {"limits": Limits(memory=2e9, cpu=1.0)}],
+    ids=str,
+)
+def test_what_its_slave_can_change_of_a_process_changes_in_place(changed: dict[str, Any]) -> None:
+    """The slave changes the running instance, also after a restart of the master.
 
     The order is lost with the master.
     """
     cluster = Cluster("a")
     cluster.apply("nav", process("p"))
-    policy = RestartPolicy("always", delay=0.5)
+    owner = cluster["p"].owner
     cluster.cut("a")
-    cluster.apply("nav", process("p", restart=policy))
+    assert actions(cluster.apply("nav", process("p", **changed))) == {"p": "change"}
     cluster.reconnect("a")
     cluster.restart_master()
     cluster.wait(3.0)
     (program_of_p,) = cluster.machines["a"].programs.values()
-    assert program_of_p.restart == policy
-    assert cluster.orders(SetRestartPolicy)[-1].restart == policy
+    assert {name: getattr(program_of_p, name) for name in changed} == changed
+    assert cluster["p"].owner == owner
     assert state_of(cluster) == (2, [])
+
+
+def test_limits_that_the_slave_refuses_lead_back() -> None:
+    """The process uses more than the new limit; it runs on with the former one."""
+    cluster = Cluster(Machine("a", uses=1e9))
+    cluster.apply("nav", process("p", limits=Limits(memory=2e9)))
+    cluster.wait(1.0)
+    owner = cluster["p"].owner
+    cluster.apply("nav", process("p", limits=Limits(memory=5e8)))
+    cluster.wait(3.0)
+    why = "nav returns from version 2 to 1: p: it is not changed: it uses 1e+09 B already"
+    assert why in cluster.recorded("application_returns")
+    assert (state_of(cluster), cluster["p"].owner) == ((1, []), owner)
+    assert cluster["p"].spec.limits == Limits(memory=2e9)
+    assert not cluster.state.unamended
 
 
 def test_a_process_in_the_queue_gets_its_new_spec() -> None:

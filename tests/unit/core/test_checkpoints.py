@@ -9,7 +9,7 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Command, SendOrder
-from rosrm.model.orders import FenceInstance, SetRestartPolicy, StartInstance, StopInstance
+from rosrm.model.orders import AmendInstance, FenceInstance, StartInstance, StopInstance
 from rosrm.model.plan import Aim, Commit, Move, Plan, Start, Stop, plan_fault
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
@@ -570,7 +570,7 @@ def test_nothing_is_lost_when_the_master_is_killed_at_any_point(asked: str, dura
 
 
 @pytest.mark.parametrize(
-    "lost", [SetRestartPolicy, "freeze", "kill", StopInstance, "take", StartInstance, "await"]
+    "lost", [AmendInstance, "freeze", "kill", StopInstance, "take", StartInstance, "await"]
 )
 def test_nothing_is_lost_when_an_answer_is(lost: str | type) -> None:
     """A lost answer leads to an undo or a retry; in the end the process runs or is checkpointed."""

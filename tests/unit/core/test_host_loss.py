@@ -10,8 +10,9 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.slave import events
-from rosrm.model.orders import FenceInstance, SetRestartPolicy
+from rosrm.model.orders import AmendInstance, FenceInstance
 from rosrm.model.values import (
+    Amendment,
     HostLossPolicy,
     InstanceState,
     IsolationPolicy,
@@ -354,14 +355,13 @@ def test_a_readopted_process_has_its_restart_policy_again() -> None:
     cluster.add(Machine("b", busy={"memory": 0.9}))  # a host in contact, without room
     cluster.wait(11.0)
     a = cluster.machines["a"]
-    a.tell(events.RestartPolicySet(a.find("p"), RestartPolicy("never")), cluster.now)
+    a.tell(events.AmendmentOrdered(a.find("p"), Amendment(RestartPolicy("never"))), cluster.now)
     lose(cluster, "a")
     assert cluster.phase("p") == "queued"
     cluster.reconnect("a", seconds=1.0)
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
-    assert [one.restart for one in cluster.orders(SetRestartPolicy)] == [
-        RestartPolicy("on-failure")
-    ]
+    amended = [one.amendment.restart for one in cluster.orders(AmendInstance)]
+    assert amended == [RestartPolicy("on-failure")]
 
 
 def test_a_process_that_was_cancelled_while_its_host_was_lost_is_not_readopted() -> None:

@@ -71,6 +71,24 @@ def test_required_limits_that_no_host_can_enforce_set_a_process_aside() -> None:
     assert cluster.where("p") == ["b"]
 
 
+@pytest.mark.parametrize(
+    "other", [{"enforce": "required"}, {"arguments": ("--fast",)}], ids=lambda one: next(iter(one))
+)
+def test_limits_of_an_application_change_with_a_new_start_where_they_must(
+    other: dict[str, Any],
+) -> None:
+    """Its host cannot enforce them and they are required, or the arguments change, too."""
+    cluster = Cluster(Partial("a", unenforced=NO_GROUPS), Partial("b", busy={"memory": 0.5}))
+    cluster.apply("nav", limited("p", memory=1e9))
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["a"]
+    enforce = {"enforce": other.pop("enforce")} if "enforce" in other else {}
+    changed = replace(limited("p", memory=5e8, **enforce), **other)
+    assert [one.action.value for one in cluster.apply("nav", changed).actions] == ["replace"]
+    cluster.wait(5.0)
+    assert cluster.where("p") == (["b"] if enforce else ["a"])
+
+
 def test_cpus_select_the_hosts_that_have_them() -> None:
     """A host of an earlier version may have them; its supervisor refuses what it cannot do."""
     cluster = Cluster(Partial("a", cpus=(0, 1, 2)), Partial("b", cpus=(2, 3, 7)))

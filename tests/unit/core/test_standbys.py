@@ -10,9 +10,16 @@ from unittest.mock import ANY
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.model.orders import FenceInstance, SetRestartPolicy, StartInstance
+from rosrm.model.orders import AmendInstance, FenceInstance, StartInstance
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
-from rosrm.model.values import HostLossPolicy, InstanceState, RestartPolicy, StandbyPolicy
+from rosrm.model.values import (
+    HostLossPolicy,
+    InstanceId,
+    InstanceState,
+    Limits,
+    RestartPolicy,
+    StandbyPolicy,
+)
 from tests.unit.core.cluster import Cluster, Machine
 from tests.unit.core.test_handoffs import stateful
 
@@ -153,9 +160,23 @@ def test_a_standby_that_does_not_start_in_time_is_replaced() -> None:
 def test_a_primary_keeps_its_restarts_beside_its_standby() -> None:
     """The plan is paused before SWITCH, and its step that suspends them is left out until then."""
     cluster = with_standby()
-    assert not cluster.orders(SetRestartPolicy)
+    assert not cluster.orders(AmendInstance)
     assert cluster.state.standbys["p"].current_step == Configure(HandoffPhase.SWITCH, ANY, undo=ANY)
     assert not cluster.recorded("migration_step")
+
+
+def test_a_standby_takes_over_with_what_has_changed_since_its_start() -> None:
+    """Its plan has the restart policy and limits of that time."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}))
+    cluster.apply("nav", stateful(standby=STANDBY))
+    cluster.wait(11.0)
+    policy, limits = RestartPolicy("never"), Limits(memory=2e9)
+    cluster.apply("nav", stateful(standby=STANDBY, restart=policy, limits=limits))
+    cluster.wait(3.0)
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.wait(5.0)
+    program = cluster.machines["b"].programs[InstanceId("p", cluster["p"].owner)]
+    assert (program.restart, program.limits) == (policy, limits)
 
 
 def test_the_end_of_a_standby_is_reported_with_its_cause() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import get_args
 
 import pytest
@@ -12,6 +13,7 @@ from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
 from rosrm.model.links import LinkPeer
 from rosrm.model.orders import (
+    AmendInstance,
     DropReplica,
     FenceInstance,
     MeasureLinks,
@@ -21,23 +23,31 @@ from rosrm.model.orders import (
     ReportInstances,
     RestartInstance,
     RunExecutor,
-    SetRestartPolicy,
     StartInstance,
     StopInstance,
 )
-from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
+from rosrm.model.values import (
+    Amendment,
+    Assignment,
+    InstanceId,
+    Limits,
+    ProcessSpec,
+    RestartPolicy,
+)
 from rosrm.ros.orders import order_from_msg, order_to_msg
 from rosrm_msgs import srv
 
 ONE = InstanceId("p", 7)
-POLICY = RestartPolicy("always", delay=2.0)
+POLICY = Amendment(RestartPolicy("always", delay=2.0))
+LIMITED = replace(POLICY, limits=Limits(memory=2e9, enforce="required"))
 ASSIGNMENT = Assignment(ONE, ProcessSpec("p", command=("true",)), epoch=3, node_name="p")
 EVENTS = [
     (StartInstance(ASSIGNMENT), happened.AssignmentsReceived((ASSIGNMENT,), 5.0)),
     (StopInstance(ONE), happened.StopOrdered(ONE)),
     (FenceInstance(ONE), happened.FenceOrdered(ONE)),
     (RestartInstance(ONE), happened.RestartOrdered(ONE)),
-    (SetRestartPolicy(ONE, POLICY), happened.RestartPolicySet(ONE, POLICY)),
+    (AmendInstance(ONE, POLICY), happened.AmendmentOrdered(ONE, POLICY)),
+    (AmendInstance(ONE, LIMITED), happened.AmendmentOrdered(ONE, LIMITED)),
     (ReportInstances(), happened.ReportRequested()),
 ]
 ORDERS = [

@@ -14,6 +14,8 @@ from rosrm.core.slave import commands as slave_commands
 from rosrm.core.slave import reducer
 from rosrm.core.slave.commands import Amend, Launch, Remember, Report, Settle, Stop
 from rosrm.core.slave.events import (
+    AmendmentOrdered,
+    AmendmentRecorded,
     AssignmentsReceived,
     ContactConfirmed,
     FenceOrdered,
@@ -23,8 +25,6 @@ from rosrm.core.slave.events import (
     Registered,
     ReportRequested,
     RestartOrdered,
-    RestartPolicyRecorded,
-    RestartPolicySet,
     SeenInGraph,
     StartDelayed,
     StopOrdered,
@@ -37,11 +37,13 @@ from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.core.slave.watches import Memo, Observation
 from rosrm.model.values import (
+    Amendment,
     Fence,
     Health,
     InstanceId,
     InstanceState,
     InstanceStatus,
+    Limits,
     ProcessSpec,
     Readiness,
     RestartPolicy,
@@ -53,8 +55,8 @@ NODE = ProcessSpec("n", module="m", ros=True, namespace="/robot", readiness=Read
 STATE = InstanceState
 ONE = InstanceId("p", 1)
 NODE_1 = InstanceId("n", 1)
-NEVER = RestartPolicy("never")
-ON_FAILURE = RestartPolicy("on-failure")
+NEVER = Amendment(RestartPolicy("never"))
+ON_FAILURE = Amendment(RestartPolicy("on-failure"))
 
 
 @pytest.fixture
@@ -330,74 +332,94 @@ def test_a_memo_of_another_version_is_none(memo) -> None:
     assert from_memo(memo) is None
 
 
-# --- another restart policy -------------------------------------------------------------------
+# --- amendments -------------------------------------------------------------------
 
 
-def test_a_restart_policy_is_settled_when_it_is_recorded(running) -> None:
+def test_an_amendment_is_settled_when_it_is_recorded(running) -> None:
     """Each repeated order is acknowledged, with the instance's status."""
     for _ in range(2):
-        assert running.step(RestartPolicySet(ONE, NEVER)) == [Amend(ONE, NEVER)]
-        report, settled = running.step(RestartPolicyRecorded(ONE, NEVER))
+        assert running.step(AmendmentOrdered(ONE, NEVER)) == [Amend(ONE, NEVER)]
+        report, settled = running.step(AmendmentRecorded(ONE, NEVER))
         assert states([report]) == [STATE.READY]
         assert settled == Settle(ONE, NEVER)
 
 
-def test_a_restart_policy_of_a_re_adopted_instance(one) -> None:
+def test_an_amendment_of_a_re_adopted_instance(one) -> None:
     """The slave lost its spec, but the supervisor has all that is needed."""
     one.step(RUNS)
-    assert one.step(RestartPolicySet(ONE, NEVER)) == [Amend(ONE, NEVER)]
+    assert one.step(AmendmentOrdered(ONE, NEVER)) == [Amend(ONE, NEVER)]
 
 
-def test_an_older_policy_that_is_recorded_does_not_settle_a_newer_one(running) -> None:
+def test_an_older_amendment_that_is_recorded_does_not_settle_a_newer_one(running) -> None:
     """Each order in progress has its own answer, if need be from the next supervisor.
 
-    The killed supervisor may have recorded the newer policy or not; the next one's answer counts.
+    The killed supervisor may have recorded the newer one or not; the next one's answer counts.
     """
-    running.step(RestartPolicySet(ONE, NEVER))
-    running.step(RestartPolicySet(ONE, ON_FAILURE))
-    assert running.step(RestartPolicyRecorded(ONE, NEVER))[-1] == Settle(ONE, NEVER)
+    running.step(AmendmentOrdered(ONE, NEVER))
+    running.step(AmendmentOrdered(ONE, ON_FAILURE))
+    assert running.step(AmendmentRecorded(ONE, NEVER))[-1] == Settle(ONE, NEVER)
     assert running.step(RUNS)[:-1] == [Amend(ONE, ON_FAILURE)]
-    running.step(RestartPolicyRecorded(ONE, ON_FAILURE))
+    running.step(AmendmentRecorded(ONE, ON_FAILURE))
     assert [type(c) for c in running.step(RUNS)] == [Report]
 
 
-def test_a_restart_policy_of_an_ended_instance_reports_its_end(running) -> None:
+def test_an_amendment_of_an_ended_instance_reports_its_end(running) -> None:
     """The master receives the end, so its plan continues; the same holds for an end in between."""
-    running.step(RestartPolicySet(ONE, NEVER))
+    running.step(AmendmentOrdered(ONE, NEVER))
     running.status(STATE.FAILED)
-    report, settled = running.step(RestartPolicySet(ONE, NEVER))
+    report, settled = running.step(AmendmentOrdered(ONE, NEVER))
     assert states([report]) == [STATE.FAILED]
     assert settled == Settle(ONE, NEVER)
     ended = replaced(InstanceStatus(ONE, STATE.FAILED))
     assert Settle(ONE, NEVER) in running.step(ended)
 
 
-def test_a_restart_policy_of_an_unknown_instance_is_refused(running) -> None:
+def test_an_amendment_of_an_unknown_instance_is_refused(running) -> None:
     """The order is refused also if only a killed supervisor could have known the instance."""
-    (settled,) = running.step(RestartPolicySet(InstanceId("q", 1), NEVER))
+    (settled,) = running.step(AmendmentOrdered(InstanceId("q", 1), NEVER))
     assert "q#1 is not known here" in settled.refusal
-    running.step(RestartPolicySet(ONE, NEVER))
+    running.step(AmendmentOrdered(ONE, NEVER))
     settled = running.step(replaced())[0]
     assert isinstance(settled, Settle)
     assert settled.refusal
 
 
-def test_a_restart_policy_of_a_held_instance(running) -> None:
-    """The waiting instance starts with the new policy, and not as a shadow."""
+def test_an_amendment_of_a_held_instance(running) -> None:
+    """The waiting instance starts with the new policy and limits, and not as a shadow."""
     running.state.max_processes = 1
     running.assign(number=2, alias="p_17", shadow=True)
     held = InstanceId("p", 2)
-    _, settled = running.step(RestartPolicySet(held, ON_FAILURE))
-    assert settled == Settle(held, ON_FAILURE)
+    amendment = replace(ON_FAILURE, limits=Limits(memory=2e9))
+    _, settled = running.step(AmendmentOrdered(held, amendment))
+    assert settled == Settle(held, amendment)
     (launch,) = [c for c in running.status(STATE.EXITED) if isinstance(c, Launch)]
     (started,) = launch.assignments
-    assert (started.spec.restart, started.shadow) == (ON_FAILURE, False)
+    assert Amendment(started.spec.restart, started.spec.limits) == amendment
+    assert not started.shadow
 
 
-def test_a_restart_policy_of_a_forgotten_instance_is_settled(running) -> None:
+def test_limits_that_change_while_an_instance_runs_are_reported(running) -> None:
+    """The instance stays ready, and the master learns which limits hold now."""
+    running.status(STATE.RUNNING, pid=7)
+    ready = running.state.held[ONE].status
+    limited = replace(ready, state=STATE.RUNNING, enforced=("limits.cpu",))
+    assert running.step(SupervisorReported((limited,))) == [
+        Report((replace(ready, enforced=("limits.cpu",)),))
+    ]
+
+
+def test_a_refusal_of_the_supervisor_settles_an_amendment(running) -> None:
+    """The order is not repeated to the next supervisor."""
+    running.step(AmendmentOrdered(ONE, NEVER))
+    refused = running.step(AmendmentRecorded(ONE, NEVER, "it uses more"))
+    assert refused[-1] == Settle(ONE, NEVER, "it uses more")
+    assert [type(one) for one in running.step(RUNS)] == [Report]
+
+
+def test_an_amendment_of_a_forgotten_instance_is_settled(running) -> None:
     """The supervisor never records it, but the master still receives an answer."""
     running.step(Registered(1))
-    running.step(RestartPolicySet(ONE, NEVER))
+    running.step(AmendmentOrdered(ONE, NEVER))
     running.status(STATE.EXITED)
     assert Settle(ONE, NEVER) in running.step(TimePassed(), after=100.0)
 
@@ -474,7 +496,9 @@ def test_a_memo_of_another_program_is_left_out() -> None:
 # --- any order of events ----------------------------------------------------------------------
 
 NUMBERS = st.integers(1, 4)
-WATCHED = ProcessSpec("w", command=("true",), health=Health(timeout=0.5), restart=ON_FAILURE)
+WATCHED = ProcessSpec(
+    "w", command=("true",), health=Health(timeout=0.5), restart=ON_FAILURE.restart
+)
 SPECS = st.sampled_from([PLAIN, NODE, WATCHED])
 FENCES = st.none() | st.builds(Fence, st.sampled_from([1.0, 5.0]), st.just(1.0))
 
@@ -512,10 +536,10 @@ class AnySlave(RuleBasedStateMachine):
                 assert runs, "a run failed that does not run"
                 assert command.pid == 7, "another run than the one that was looked at"
             elif isinstance(command, slave_commands.Amend):
-                assert command.instance in self.alive, "a policy for what does not run"
-                self.amending.append((command.instance, command.restart))
+                assert command.instance in self.alive, "a change of what does not run"
+                self.amending.append((command.instance, command.amendment))
             elif isinstance(command, slave_commands.Settle):
-                self.unsettled.discard((command.instance, command.restart))
+                self.unsettled.discard((command.instance, command.amendment))
             elif isinstance(command, slave_commands.Forget):
                 assert not self.alive.keys() & set(command.instances), "a live one forgotten"
 
@@ -550,16 +574,16 @@ class AnySlave(RuleBasedStateMachine):
     def restart(self, spec, number) -> None:
         self.feed(RestartOrdered(InstanceId(spec.name, number)))
 
-    @rule(spec=SPECS, number=NUMBERS, restart=st.sampled_from([NEVER, ON_FAILURE]))
-    def set_restart(self, spec, number, restart) -> None:
+    @rule(spec=SPECS, number=NUMBERS, amendment=st.sampled_from([NEVER, ON_FAILURE]))
+    def amend(self, spec, number, amendment) -> None:
         instance = InstanceId(spec.name, number)
-        self.unsettled.add((instance, restart))
-        self.feed(RestartPolicySet(instance, restart))
+        self.unsettled.add((instance, amendment))
+        self.feed(AmendmentOrdered(instance, amendment))
 
     @precondition(lambda self: self.amending)
     @rule()
     def record(self) -> None:
-        self.feed(RestartPolicyRecorded(*self.amending.pop(0)))
+        self.feed(AmendmentRecorded(*self.amending.pop(0)))
 
     @rule(reads=st.booleans())
     def replace_supervisor(self, reads) -> None:
@@ -626,7 +650,7 @@ class AnySlave(RuleBasedStateMachine):
 
     @invariant()
     def every_order_is_or_will_be_settled(self) -> None:
-        pending = {(i, restart) for i, h in self.state.held.items() for restart in h.unsettled}
+        pending = {(i, one) for i, h in self.state.held.items() for one in h.unsettled}
         assert self.unsettled <= pending | set(self.amending)
 
     @invariant()

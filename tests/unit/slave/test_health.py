@@ -15,6 +15,7 @@ from rosrm.core.slave.commands import Command, Fail, Remember
 from rosrm.core.slave.health import LOOK_PERIOD, InstanceHealth, resolve, watch_of
 from rosrm.core.slave.watches import Awaited, Memo, NoState, Observation, Watch
 from rosrm.model.values import (
+    Amendment,
     Assignment,
     Health,
     InstanceId,
@@ -260,7 +261,7 @@ def test_a_shadow_is_watched_when_it_is_none_any_more() -> None:
     one = running(shadow=True)
     assert one.state.watched() == {}
     assert looks(one, 10.0) == []
-    commands = one.step(events.RestartPolicySet(LIDAR, ALWAYS))
+    commands = one.step(events.AmendmentOrdered(LIDAR, Amendment(ALWAYS)))
     (memo,) = [command.memo for command in commands if isinstance(command, Remember)]
     later = Slave()
     later.step(events.SupervisorReplaced((RUNS,), {LIDAR: memo}))
@@ -274,9 +275,9 @@ def test_an_unhealthy_run_is_failed_unless_it_is_being_moved() -> None:
     """
     one = running()
     looks(one, 3.0)
-    one.step(events.RestartPolicySet(LIDAR, NEVER))
+    one.step(events.AmendmentOrdered(LIDAR, Amendment(NEVER)))
     assert looks(one, 20.0) == []
-    one.step(events.RestartPolicySet(LIDAR, ALWAYS))
+    one.step(events.AmendmentOrdered(LIDAR, Amendment(ALWAYS)))
     assert looks(one, 3.0) == []
     for _ in range(2):
         (fail,) = looks(one, 10.0)
@@ -289,7 +290,7 @@ def test_a_shadow_that_waits_for_a_slot_is_watched_later() -> None:
     one = Slave(max_processes=1)
     one.assign(replace(PROCESS, name="other"))
     one.assign(PROCESS, alias="lidar_1", shadow=True)
-    one.step(events.RestartPolicySet(LIDAR, ALWAYS))
+    one.step(events.AmendmentOrdered(LIDAR, Amendment(ALWAYS)))
     watch = one.of("lidar").watch
     assert watch is not None
     assert not watch.paused

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 
 from rosrm.core.supervisor.events import (
-    AmendOrdered,
     ContactReported,
     FailOrdered,
     FenceOrdered,
@@ -16,7 +15,7 @@ from rosrm.core.supervisor.events import (
     StatusStored,
     StopOrdered,
 )
-from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, RunLimits, StopRule
 from rosrm.supervisor import json_lines as ls
 from rosrm.supervisor import messages
 from rosrm.supervisor.logs import LogLimits
@@ -35,6 +34,7 @@ RULES = st.builds(
     st.integers(0, 99),
     SECONDS,
 )
+RUN_LIMITS = st.builds(RunLimits, *[SECONDS] * 3, st.booleans())
 LIMITS = st.builds(
     LimitRule,
     *[SECONDS] * 3,
@@ -68,7 +68,7 @@ ORDERS = st.one_of(
     st.builds(ContactReported, SECONDS, SECONDS),
     st.builds(RestartOrdered, KEYS),
     st.builds(FailOrdered, KEYS, st.integers(1, 2**31), st.text(), st.booleans()),
-    st.builds(messages.Amend, st.builds(AmendOrdered, KEYS, RULES), CHANGES),
+    st.builds(messages.Amend, KEYS, RULES, CHANGES, st.none() | RUN_LIMITS),
     st.builds(messages.Remember, KEYS, st.text()),
     st.builds(messages.Forget, st.lists(st.builds(StatusStored, KEYS)).map(tuple)),
     st.just(ShutdownOrdered()),

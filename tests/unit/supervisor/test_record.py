@@ -11,7 +11,7 @@ import pytest
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import EXITED, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
-from rosrm.core.supervisor.rules import RestartRule, StopRule
+from rosrm.core.supervisor.rules import LimitRule, RestartRule, RunLimits, StopRule
 from rosrm.supervisor import instance_record as rc
 from rosrm.supervisor.messages import Amend, Launch
 
@@ -62,10 +62,10 @@ def test_the_kills_before_a_run_are_restored(tmp_path, core, record):
 
 
 def test_an_amendment_counts_from_then_on(tmp_path, core, record):
-    """A confirmed shadow has another policy and environment, also after compaction."""
-    amend = Amend(events.AmendOrdered(TALKER, RestartRule("on-failure")), {"ROSRM_SHADOW": None})
-    amended = LAUNCH.amended(amend)
-    core.handle(amend.order, 1.0)
+    """A confirmed shadow has another policy, environment and limits, also after compaction."""
+    policy, limits = RestartRule("on-failure"), RunLimits(5e8, 0.0, 1.5, required=False)
+    amended = LAUNCH.amended(Amend(TALKER, policy, {"ROSRM_SHADOW": None}, limits))
+    core.handle(events.AmendOrdered(TALKER, policy), 1.0)
     record.launch(amended)
     record.state(core.instances[TALKER], 55)
     record.flush()
@@ -73,6 +73,7 @@ def test_an_amendment_counts_from_then_on(tmp_path, core, record):
         recorded = rc.read(str(tmp_path))
         assert recorded.launches == {TALKER: amended}
         assert recorded.launches[TALKER].changes == {"ROSRM_SHADOW": None}
+        assert recorded.launches[TALKER].limits == LimitRule(memory=5e8, cpu=1.5)
         assert recorded.launches[TALKER].memo == "memo"
         assert recorded.instances[TALKER].restart.when == "on-failure"
         record.rewrite(core, {TALKER: amended}, {"base": {}}, lambda key: 55)

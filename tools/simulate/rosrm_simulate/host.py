@@ -24,22 +24,25 @@ from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.devices import Device
 from rosrm.model.orders import (
+    NOT_AMENDED,
+    AmendInstance,
     DropReplica,
     MeasureLinks,
     ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
-    SetRestartPolicy,
 )
 from rosrm.model.values import (
     EMPTY,
     MOST_USED,
     RESOURCE_SLOTS,
+    Amendment,
     Assignment,
     HostDescription,
     InstanceId,
     InstanceState,
     InstanceStatus,
+    Limits,
     ResourceDescription,
     RestartPolicy,
 )
@@ -53,12 +56,14 @@ class Program:
 
     Attributes:
         restart: restart policy that the supervisor applies when the instance ends.
+        limits: as last changed while it runs.
         run: number of its restarts; a delayed action for an earlier run has no effect.
     """
 
     assignment: Assignment
     restart: RestartPolicy
     pid: int
+    limits: Limits = field(default_factory=Limits)
     state: InstanceState = InstanceState.STARTING
     run: int = 0
 
@@ -89,6 +94,7 @@ class Host(ABC, Generic[ProgramT]):
     Attributes:
         limits: upper limits, fractions by resource.
         busy: usage by other programs, fractions by resource.
+        uses: bytes of memory below which no program's limit can be set while it runs.
         devices: devices of the host.
         start_time, stop_time: seconds that a program takes to start and to stop.
         incarnation: of its slave.
@@ -109,6 +115,7 @@ class Host(ABC, Generic[ProgramT]):
     labels: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     max_processes: int = 0
     busy: Mapping[str, float] = field(default_factory=lambda: EMPTY)
+    uses: float = 0.0
     period: float = 0.1
     start_time: float = 0.0
     stop_time: float = 0.0
@@ -261,9 +268,9 @@ class Host(ABC, Generic[ProgramT]):
                     self._end(instance, InstanceState.FENCED, now, signal=_SIGKILL)
             case commands.Restart(instance):
                 self._restart(instance, now)
-            case commands.Amend(instance, restart):
-                self.programs[instance].restart = restart
-                self.tell(events.RestartPolicyRecorded(instance, restart), now)
+            case commands.Amend(instance, amendment):
+                refusal = self._amend(self.programs[instance], amendment)
+                self.tell(events.AmendmentRecorded(instance, amendment, refusal), now)
             case commands.Settle():
                 self._settled.append(command)
             case commands.Forget(instances):
@@ -272,7 +279,7 @@ class Host(ABC, Generic[ProgramT]):
 
     def obey(self, sent: SendOrder, now: float) -> OrderAnswered:
         """Carry out an order, and return the answer."""
-        order, refusal = sent.order, ""
+        order, refusal, code = sent.order, "", "refused"
         match order:
             case RunExecutor():
                 return self.execute(sent.order_id, order)
@@ -282,14 +289,14 @@ class Host(ABC, Generic[ProgramT]):
                 self.replicate(order)
             case ReloadSettings():
                 refusal = "a simulated host has no file"
-            case SetRestartPolicy():
+            case AmendInstance():
                 self._settled.clear()
                 self.tell(event_of(order), now)
                 (settled,) = self._settled
-                refusal = settled.refusal
+                refusal, code = settled.refusal, NOT_AMENDED
             case _:
                 self.tell(event_of(order), now)
-        return OrderAnswered(sent.order_id, not refusal, "refused" if refusal else "", refusal)
+        return OrderAnswered(sent.order_id, not refusal, code if refusal else "", refusal)
 
     def shut_down(self, now: float) -> None:
         """Stop all instances, as a slave does that leaves."""
@@ -298,6 +305,14 @@ class Host(ABC, Generic[ProgramT]):
                 self.tell(events.StopOrdered(instance), now)
 
     # --- programs --------------------------------------------------------------------------
+
+    def _amend(self, program: ProgramT, amendment: Amendment) -> str:
+        """Change a program; return why nothing changes, "": it does."""
+        limits = amendment.limits or program.limits
+        if 0.0 < limits.memory < self.uses:
+            return f"it uses {self.uses:g} B already"
+        program.restart, program.limits = amendment.restart, limits
+        return ""
 
     def next_pid(self) -> int:
         """Return the pid of a program that starts."""

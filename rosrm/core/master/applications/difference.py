@@ -13,8 +13,9 @@ from rosrm.model.applications import Action
 from rosrm.model.values import ProcessSpec
 
 #: Fields that only the master reads, and `restart`, whose change a slave can apply to a running
-#: instance. A change of any other field takes effect with the next start. (Of `array` only the
-#: number of jobs at a time changes: the index is part of the name.)
+#: instance. A change of any other field takes effect with the next start, except that of `limits`
+#: where the host can change them. (Of `array` only the number of jobs at a time changes: the index
+#: is part of the name.)
 IN_PLACE: Final = frozenset(
     {
         "restart", "needs", "required_labels", "preferred_labels", "avoided_labels", "priority",
@@ -80,7 +81,7 @@ def difference_of(
     changed = changed_fields(current, spec)
     if not changed:
         return None
-    in_place = IN_PLACE.issuperset(changed)
+    in_place = _needs_no_start(state, process, changed, spec)
     return Difference(Action.CHANGE if in_place else Action.REPLACE, changed)
 
 
@@ -90,7 +91,7 @@ def _of_ended(process: Process, spec: ProcessSpec) -> Difference | None:
     A change that needs no new start does not repeat a job.
     """
     changed = changed_fields(process.spec, spec)
-    if process.is_finished_job and IN_PLACE.issuperset(changed):
+    if process.is_finished_job and IN_PLACE.union({"limits"}).issuperset(changed):
         return None
     return Difference(Action.START, changed, f"it is {process.phase.value} now")
 
@@ -102,8 +103,27 @@ def changed_fields(spec: ProcessSpec, other: ProcessSpec) -> tuple[str, ...]:
     return tuple(name for name in _FIELDS if getattr(spec, name) != getattr(other, name))
 
 
-def with_changes_in_place(spec: ProcessSpec, desired: ProcessSpec) -> ProcessSpec:
-    """Return a spec with those fields of the desired one that need no new start."""
+def with_changes_in_place(
+    state: MasterState, process: Process, desired: ProcessSpec
+) -> ProcessSpec:
+    """Return the spec of a process with those fields of the desired one that need no new start."""
+    spec = process.spec
+    if _needs_no_start(state, process, changed_fields(spec, desired), desired):
+        return desired
     if _in_place_of(spec) == _in_place_of(desired):
         return spec
     return replace(spec, **{name: getattr(desired, name) for name in IN_PLACE})
+
+
+def _needs_no_start(
+    state: MasterState, process: Process, changed: Iterable[str], desired: ProcessSpec
+) -> bool:
+    """Return True if a process can be as desired without a new start."""
+    others = set(changed) - IN_PLACE
+    if others != {"limits"}:
+        return not others
+    owner = state.instances.get(process.owner)
+    return owner is not None and (
+        desired.limits.enforce != "required"
+        or owner.host.enforces(desired.enforcement, desired.cpus)
+    )

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from rosrm.core.master import lifecycle
 from rosrm.core.master.answers import order_answered
-from rosrm.core.master.applications import restart_policies, rollout
+from rosrm.core.master.applications import amendments, rollout
 from rosrm.core.master.applications.difference import changed_fields
 from rosrm.core.master.commands import Assign, Command, PublishStateConfig, SendOrder
 from rosrm.core.master.consequences import follow_up
@@ -125,7 +125,7 @@ def _run(state: MasterState, now: float) -> None:
     for _ in range(_MOST_ROUNDS):
         _settle(state, now)
         rollout.review(state, now)
-        restart_policies.review(state, now)
+        amendments.review(state, now)
         preempt(state, now)
         _settle(state, now)
         after = _progress(state)

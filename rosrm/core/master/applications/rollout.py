@@ -8,7 +8,7 @@ process                     step
 ==========================  ==================================================================
 is not desired              cancel it; the task ends when the process has ended
 does not exist, has ended   add it to the queue; the task ends when the process runs well
-differs in place            change its spec; its slave gets a changed restart policy
+differs in place            change its spec; its slave changes the running instance
 waits in the queue          replace its spec
 waits for its next run      replace its spec
 runs, and can be replaced   migrate it to an instance of the new spec
@@ -174,11 +174,11 @@ def _begin(state: MasterState, application: Application, task: Task) -> None:
 def _change_in_place(state: MasterState, process: Process, spec: ProcessSpec, now: float) -> None:
     """Apply those changes of a spec that need no new start."""
     before = process.spec
-    changed = with_changes_in_place(before, spec)
-    if changed is before:
+    changed = with_changes_in_place(state, process, spec)
+    if changed == before:
         return
     state.set_spec(process, changed)
-    if changed.restart != before.restart and process.owner:
+    if (changed.restart, changed.limits) != (before.restart, before.limits) and process.owner:
         state.unamended[process.name] = -inf
     if process.phase is ProcessPhase.SET_ASIDE:
         reconsider_set_aside(state, now)
@@ -217,7 +217,7 @@ def _runs_well(
 ) -> bool:
     """Return True if a process with the desired spec has run well for long enough."""
     if not task.begun:  # it was only changed in place
-        task.reason = "waits until its slave has the new restart policy"
+        task.reason = "waits until its slave has changed it"
         return process.name not in state.unamended
     task.reason = process.reason or f"it is {process.phase.value}"
     run, is_running = (process.owner, process.restarts), process.phase is ProcessPhase.RUNNING

@@ -6,11 +6,12 @@ job that has completed in between is complete. If a successor has started, the i
 
 from __future__ import annotations
 
+from math import inf
+
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, LeftBehind, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.orders import SetRestartPolicy
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
 
@@ -50,9 +51,10 @@ def _readopt(
         now, EventKind.READOPTED, f"{host.name} reports again: {instance.id} still runs there",
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
+    # A migration at the time of the loss may have ordered the slave not to restart the instance,
+    # and its application may have changed since.
+    state.unamended[process.name] = -inf
     state.save(process)
-    # A migration at the time of the loss may have ordered the slave not to restart the instance.
-    state.send(host, SetRestartPolicy(instance.id, process.spec.restart))
 
 
 def has_successor(state: MasterState, status: InstanceStatus) -> bool:

@@ -8,6 +8,7 @@ active. The plan then continues as usual, forward or back.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
@@ -58,6 +59,7 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     process.wanted = DesiredState.RUN
     state.clear_left_behind(process)
     process.standby_reason = ""
+    state.unamended[process.name] = -inf  # it may have changed since the standby was started
     state.migrations[process.name] = migration
     why, host = migration.cause, migration.destination_host.name
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {why}")

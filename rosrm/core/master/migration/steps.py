@@ -19,7 +19,7 @@ from rosrm.core.master.outcomes import (
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.pending_orders import MigrationStep
-from rosrm.model.orders import Order, RunExecutor, SetRestartPolicy, StartInstance, StopInstance
+from rosrm.model.orders import AmendInstance, Order, RunExecutor, StartInstance, StopInstance
 from rosrm.model.plan import (
     Aim,
     AwaitReady,
@@ -32,7 +32,7 @@ from rosrm.model.plan import (
     Step,
     Stop,
 )
-from rosrm.model.values import InstanceState
+from rosrm.model.values import Amendment, InstanceState
 
 _TITLES: Final[Mapping[type[Step], str]] = {
     Commit: "the commit",
@@ -147,7 +147,7 @@ def _order_of(
         if step.restart != spec.restart:
             migration.suspended.add(step.instance.number)
             state.save_migration(migration)
-        return SetRestartPolicy(step.instance, step.restart)
+        return AmendInstance(step.instance, Amendment(step.restart))
     return _start(state, migration, step, now)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from rosrm.core.master.commands import OrderId
-from rosrm.model.values import InstanceId, RestartPolicy
+from rosrm.model.values import Amendment, InstanceId
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,11 +65,11 @@ class Reload:
 
 
 @dataclass(frozen=True, slots=True)
-class RestartPolicyChange:
-    """The order gives a new restart policy to an instance."""
+class InstanceAmendment:
+    """The order changes an instance that runs on."""
 
     instance: InstanceId
-    restart: RestartPolicy
+    amendment: Amendment
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +82,7 @@ class DependencyRestart:
 
 Purpose = (
     MigrationStep
-    | RestartPolicyChange
+    | InstanceAmendment
     | ImageRemoval
     | Replication
     | CapabilityQuery
