@@ -7,6 +7,7 @@ tick.py        periodic work
 requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
                pruning.py, graph_names.py, cancellation.py
 answers.py     answers of slaves to orders; reloading.py
+garbage.py     removal of what has ended from memory and journal
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
 start_order.py starts after other processes, stops before them; dependants.py
 consequences.py the end of each step: what a change makes possible or necessary

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import astuple, dataclass
 from math import inf
-from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -16,7 +14,6 @@ from rosrm.core.master.hosts.fencing import fence_of
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
-from rosrm.core.master.state import applications
 from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand, RankingKey
@@ -25,18 +22,19 @@ from rosrm.core.master.state.gangs import Gangs
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
+from rosrm.core.master.state.intents import Unsaved, mode_intent, modes_intent, version_intent
+from rosrm.core.master.state.journal_gap import JournalGap
 from rosrm.core.master.state.lazy import Plain
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.link_queries import LinkQueries
-from rosrm.core.master.state.migration import Migration, migration_to_dict
-from rosrm.core.master.state.modes import Modes, mode_to_dict, modes_to_dict
+from rosrm.core.master.state.migration import Migration
+from rosrm.core.master.state.modes import Modes
 from rosrm.core.master.state.moving import Preemption, Rebalancing
 from rosrm.core.master.state.neighbours import NeighbourRules
 from rosrm.core.master.state.pending_orders import PendingOrders, Purpose
 from rosrm.core.master.state.periodic import Periodic
 from rosrm.core.master.state.process import (
     BEFORE_START,
-    JOURNALED,
     DesiredState,
     Instance,
     Process,
@@ -50,7 +48,6 @@ from rosrm.core.master.state.start_orders import StartOrders
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import ChainOf, PlacementPlugins, PolicySettings
-from rosrm.model.codec import to_plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.modes import Mode
@@ -68,34 +65,10 @@ _RESERVED: Final = 1000
 _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING})
 #: Phases in which a run ends; if the process has a schedule, it waits for the next run.
 _ENDS_OF_RUNS: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED})
-#: Number of removed processes whose replicas are dropped when a host returns with one.
-_MOST_REMOVED: Final = 10_000
-#: Faster than `fields_to_plain`: each decision waits until its process is saved.
-_journaled_of: Final = attrgetter(*JOURNALED)
 #: Most letters of the message of a record.
 _LONGEST_RECORD: Final = 10_000
 #: Seconds between two records of the same kind about the same host.
 RECORD_PERIOD: Final = 10.0
-
-
-@dataclass(slots=True)
-class JournalGap:
-    """Records that the journal may have lost before this master started.
-
-    Attributes:
-        newest: sequence of the newest record at the start.
-        started: time of the start.
-        machine_rebooted: True if the machine had rebooted, until every host has rejoined or is
-            lost.
-        lost: number of records that are known to be lost.
-        records_missing: True if records are lost, until one lease after the start.
-    """
-
-    newest: int = LARGEST_NUMBER
-    started: float = 0.0
-    machine_rebooted: bool = False
-    lost: int = 0
-    records_missing: bool = False
 
 
 class MasterState:
@@ -126,6 +99,7 @@ class MasterState:
         scoring_in_force: the same with these weights.
         reloads: requests to reload, and the answers to them.
         plugins: guards every call of a plugin.
+        unsaved: parts that the current event has changed and the journal does not have yet.
     """
 
     def __init__(  # noqa: PLR0915 - a statement for each part of the state
@@ -191,9 +165,7 @@ class MasterState:
         self.reviewed = -inf
         self.demands: dict[RankingKey, Demand] = {}
         self._out: list[Command] = []
-        self._unsaved: dict[str, Process] = {}
-        self._unsaved_migrations: dict[str, Migration] = {}
-        self._unsaved_applications: dict[str, Application] = {}
+        self.unsaved = Unsaved()
 
     # --- commands ------------------------------------------------------------------------
 
@@ -203,16 +175,7 @@ class MasterState:
 
     def take(self) -> list[Command]:
         """Return and clear the commands of the current event."""
-        for process in self._unsaved.values():
-            self._out.append(self._intent_of(process))
-        self._unsaved.clear()
-        for migration in self._unsaved_migrations.values():
-            self._out.append(self._intent_of_migration(migration))
-        self._unsaved_migrations.clear()
-        for name, application in self._unsaved_applications.items():
-            plain = applications.application_to_dict(application)
-            self._out.append(Intent("application", name, plain))
-        self._unsaved_applications.clear()
+        self._out += self.unsaved.take(self)
         out, self._out = self._out, []
         return out
 
@@ -244,79 +207,40 @@ class MasterState:
 
     def save(self, process: Process) -> None:
         """Persist the desired state of a process, as it stands after the current event."""
-        self._unsaved[process.name] = process
-
-    def _intent_of(self, process: Process) -> Intent:
-        owner, left = self.instances.get(process.owner), process.left_behind
-        phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
-        standby = self.standbys.get(process.name)
-        held = {str(number): self.instances[number].host.name for number in process.instances}
-        aliases = {
-            str(number): alias
-            for number in process.instances
-            if (alias := self.instances[number].node_name)
-        }
-        devices = {
-            str(number): to_plain(given)
-            for number in process.instances
-            if (given := self.instances[number].devices)
-        }
-        return Intent(
-            "process", process.name,
-            {
-                "spec": process.plain, "next_spec": to_plain(process.next_spec),
-                "phase": phase.value, "since": began,
-                "host": owner.host.name if owner else process.ended_on, "instances": held,
-                "node_names": aliases, "devices": devices,
-                "standby": standby and migration_to_dict(standby, ()),
-                "left_behind": left and astuple(left),
-                "image": process.image and to_plain(process.image),
-                **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
-                "excluded": dict(process.excluded),
-                "failed_on": process.failed_on and to_plain(process.failed_on),
-                "amended": process.name not in self.unamended,
-            },
-        )  # fmt: skip
+        self.unsaved.processes[process.name] = process
 
     def save_migration(self, migration: Migration) -> None:
         """Persist the progress of a migration, as it stands after the current event."""
         if self.standbys.get(migration.process) is migration:
             self.save(self.processes[migration.process])
             return
-        self._unsaved_migrations[migration.process] = migration
+        self.unsaved.migrations[migration.process] = migration
 
     def end_migration(self, migration: Migration) -> None:
         """Remove a migration that has ended."""
         del self.migrations[migration.process]
         self.release_ended(migration.process, migration.source_host)
-        self._unsaved_migrations.pop(migration.process, None)
+        self.unsaved.migrations.pop(migration.process, None)
         self.emit(Intent("migration", migration.process, None))
-
-    def _intent_of_migration(self, migration: Migration) -> Intent:
-        numbers = sorted(self.processes[migration.process].instances)
-        stopping = [number for number in numbers if self.instances[number].stopping]
-        return Intent("migration", migration.process, migration_to_dict(migration, stopping))
 
     def save_application(self, application: Application) -> None:
         """Persist the desired version and the tasks of an application."""
-        self._unsaved_applications[application.name] = application
+        self.unsaved.applications[application.name] = application
 
     def save_version(self, application: Application, version: Version) -> None:
         """Persist a version of an application, and drop the oldest ones."""
         application.versions[version.number] = version
-        key_of = applications.key_of
-        plain = applications.version_to_dict(version)
-        self.emit(Intent("version", key_of(application.name, version.number), plain))
+        self.emit(version_intent(application.name, version.number, version))
         for dropped in application.keep(self.settings.keep_versions):
-            self.emit(Intent("version", key_of(application.name, dropped), None))
+            self.emit(version_intent(application.name, dropped, None))
 
     def save_modes(self) -> None:
         """Persist which mode is in force, and the progress of a switch."""
-        self.emit(Intent("cluster", "modes", modes_to_dict(self.modes)))
+        self.emit(modes_intent(self.modes))
 
     def save_mode(self, name: str, mode: Mode | None) -> None:
         """Persist a mode; None: it is removed."""
-        self.emit(Intent("mode", name, None if mode is None else mode_to_dict(mode)))
+        self.emit(mode_intent(name, mode))
 
     def send(self, host: Host, order: Order, purpose: Purpose | None = None) -> OrderId:
         """Send an order to the slave of a host and return its id.
@@ -428,62 +352,9 @@ class MasterState:
         self.start_orders.note_change(process.name)
         self.save(process)
 
-    def collect_garbage(self) -> None:
-        """Remove terminal processes beyond the newest `keep_ended` that may be removed."""
-        excess = len(self.terminal) - self.settings.keep_ended
-        if excess <= 0:
-            return
-        gone = [name for name in self.terminal if self.is_gone(self.processes[name])]
-        for name in gone[:excess]:
-            self.remove_process(name)
-
-    def is_gone(self, process: Process) -> bool:
-        """Return True if a terminal process may be removed.
-
-        Neither an instance nor a standby of it may run, no live process starts after it, and it is
-        no finished job that its application still wants: without it, the job would run again.
-        """
-        is_used = process.name in self.start_orders.dependants or self.is_wanted_job(process)
-        return not self.may_run(process) and not is_used
-
-    def is_wanted_job(self, process: Process) -> bool:
-        """Return True for a finished job of the desired version of an application."""
-        application = self.applications.get(process.spec.application)
-        finished = process.phase is ProcessPhase.FINISHED
-        return finished and application is not None and process.name in application.specs
-
-    def remove_application(self, application: Application) -> None:
-        """Remove a cancelled application with its versions from memory and journal."""
-        del self.applications[application.name]
-        self._unsaved_applications.pop(application.name, None)
-        for number in application.versions:
-            key = applications.key_of(application.name, number)
-            self.emit(Intent("version", key, None))
-        self.emit(Intent("application", application.name, None))
-
     def may_run(self, process: Process) -> bool:
         """Return True if an instance or a standby of a process may run."""
         return bool(process.instances) or process.name in self.standbys
-
-    def remove_process(self, name: str) -> None:
-        """Remove a terminal process from memory and journal; none of its instances may run."""
-        del self.terminal[name]
-        self.replication.last_orders.pop(name, None)
-        if self.declared.has_snapshots(self.processes.pop(name).spec):
-            self._note_removed(name)
-        self._unsaved.pop(name, None)
-        self.emit(Intent("process", name, None))
-
-    def _note_removed(self, name: str) -> None:
-        """Journal the removal of a stateful process, because a host may return with a replica."""
-        removed = self.replication.removed
-        removed.pop(name, None)  # oldest first
-        removed[name] = self.next_instance
-        self.emit(Intent("removed", name, {"next": self.next_instance}))
-        if len(removed) > _MOST_REMOVED:
-            oldest = next(iter(removed))
-            del removed[oldest]
-            self.emit(Intent("removed", oldest, None))
 
     def enqueue(self, process: Process, now: float, reason: str = "") -> None:
         """Queue a process at its place, given by its priority and order of submission."""

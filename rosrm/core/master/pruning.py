@@ -7,6 +7,12 @@ from typing import Final
 from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import Reply
+from rosrm.core.master.garbage import (
+    is_gone,
+    is_wanted_job,
+    remove_application,
+    remove_process,
+)
 from rosrm.core.master.hosts.liveness import lease_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import RequestRefused
@@ -40,10 +46,10 @@ def prune_requested(state: MasterState, event: happened.PruneRequested, now: flo
         ]
         hosts = [host for host in left if not _why_not_pruned_host(state, host, now)]
     for process in processes:
-        state.remove_process(process.name)
+        remove_process(state, process.name)
     applications = [] if event.names or event.hosts else _cancelled_applications(state, event.by)
     for application in applications:
-        state.remove_application(application)
+        remove_application(state, application)
     left_running = [_prune_host(state, host, event.by, now) for host in hosts]
     removed = [count(len(processes))] if processes else []
     removed += [counted(len(applications), "application")] if applications else []
@@ -88,13 +94,13 @@ def _why_not_pruned(state: MasterState, process: Process) -> str:
         names = list(state.start_orders.dependants[process.name])
         after = f"{each_of(names)} starts after {process.name}, and has not ended"
         return f"{after}; cancel {listed(names)} first"
-    if state.is_wanted_job(process):
+    if is_wanted_job(state, process):
         name = process.spec.application
         return (
             f"{process.name} is a finished job of the application {name}, and would run again at "
             f"the next `rosrm apply`; cancel {name}, or remove the job from its file first"
         )
-    return "" if state.is_gone(process) else f"the standby of {process.name} is being ended"
+    return "" if is_gone(state, process) else f"the standby of {process.name} is being ended"
 
 
 def _why_not_pruned_host(state: MasterState, host: Host, now: float) -> str:

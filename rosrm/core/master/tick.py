@@ -11,6 +11,7 @@ from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
 from rosrm.core.master.assignment.reservations import review_reservation
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.commands import Redeliver, Withdraw
+from rosrm.core.master.garbage import collect_garbage
 from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
@@ -68,7 +69,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     replication.review(state, now)
     periodic.review(state, now)
     reconsider_set_aside(state, now)
-    state.collect_garbage()
+    collect_garbage(state)
 
 
 def _review_instance(state: MasterState, instance: Instance, now: float) -> None:

@@ -1,0 +1,109 @@
+"""Intents: desired states as the journal has them, one for each part that an event has changed."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from operator import attrgetter
+from typing import Final, Protocol
+
+from rosrm.core.master.state.applications import (
+    Application,
+    Version,
+    application_to_dict,
+    key_of,
+    version_to_dict,
+)
+from rosrm.core.master.state.migration import Migration, migration_to_dict
+from rosrm.core.master.state.modes import Modes, mode_to_dict, modes_to_dict
+from rosrm.core.master.state.process import JOURNALED, Instance, Process
+from rosrm.model.codec import to_plain
+from rosrm.model.modes import Mode
+from rosrm.model.records import Intent
+
+#: Faster than `fields_to_plain`: each decision waits until its process is saved.
+_journaled_of: Final = attrgetter(*JOURNALED)
+
+
+class Tables(Protocol):
+    """The tables of the master's state that intents of processes and migrations are made of."""
+
+    processes: dict[str, Process]
+    instances: dict[int, Instance]
+    standbys: dict[str, Migration]
+    unamended: dict[str, float]
+
+
+class Unsaved:
+    """Parts of the state that the current event has changed, each by its name.
+
+    The intent of a part is made once, after the event, however often the event changes the part.
+    """
+
+    def __init__(self) -> None:
+        self.processes: dict[str, Process] = {}
+        self.migrations: dict[str, Migration] = {}
+        self.applications: dict[str, Application] = {}
+
+    def take(self, tables: Tables) -> list[Intent]:
+        """Return the intents of all parts, and clear them."""
+        found = [process_intent(tables, one) for one in self.processes.values()]
+        found += [migration_intent(tables, one) for one in self.migrations.values()]
+        found += [application_intent(one) for one in self.applications.values()]
+        self.processes.clear()
+        self.migrations.clear()
+        self.applications.clear()
+        return found
+
+
+def process_intent(tables: Tables, process: Process) -> Intent:
+    """Return the desired state of a process with its instances and its standby."""
+    instances = [(str(number), tables.instances[number]) for number in process.instances]
+    owner, left = tables.instances.get(process.owner), process.left_behind
+    phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
+    standby = tables.standbys.get(process.name)
+    return Intent(
+        "process", process.name,
+        {
+            "spec": process.plain, "next_spec": to_plain(process.next_spec),
+            "phase": phase.value, "since": began,
+            "host": owner.host.name if owner else process.ended_on,
+            "instances": {number: one.host.name for number, one in instances},
+            "node_names": {number: one.node_name for number, one in instances if one.node_name},
+            "devices": {number: to_plain(one.devices) for number, one in instances if one.devices},
+            "standby": standby and migration_to_dict(standby, ()),
+            "left_behind": left and astuple(left),
+            "image": process.image and to_plain(process.image),
+            **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
+            "excluded": dict(process.excluded),
+            "failed_on": process.failed_on and to_plain(process.failed_on),
+            "amended": process.name not in tables.unamended,
+        },
+    )  # fmt: skip
+
+
+def migration_intent(tables: Tables, migration: Migration) -> Intent:
+    """Return the progress of a migration."""
+    numbers = sorted(tables.processes[migration.process].instances)
+    stopping = [number for number in numbers if tables.instances[number].stopping]
+    return Intent("migration", migration.process, migration_to_dict(migration, stopping))
+
+
+def application_intent(application: Application) -> Intent:
+    """Return the desired version and the tasks of an application."""
+    return Intent("application", application.name, application_to_dict(application))
+
+
+def version_intent(application: str, number: int, version: Version | None) -> Intent:
+    """Return a version of an application; None: it is removed."""
+    plain = None if version is None else version_to_dict(version)
+    return Intent("version", key_of(application, number), plain)
+
+
+def modes_intent(modes: Modes) -> Intent:
+    """Return which mode is in force, and the progress of a switch."""
+    return Intent("cluster", "modes", modes_to_dict(modes))
+
+
+def mode_intent(name: str, mode: Mode | None) -> Intent:
+    """Return a mode; None: it is removed."""
+    return Intent("mode", name, None if mode is None else mode_to_dict(mode))
