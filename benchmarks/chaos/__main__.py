@@ -76,7 +76,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 def _run(options: argparse.Namespace, out: Path, tally: Tally, began: float) -> None:
     """Run the rounds in one lab; start another lab where one gets stuck."""
     event_log = EventLog(options.seed)
-    services = list(work.services())
+    services = [*work.services(), *work.rolled()]
     names = [service.name for service in services]
     movable = [service.name for service in services if service.sort.strategy]
     rounds = draw(options.seed, HOSTS, names, movable)
@@ -131,11 +131,12 @@ def _report(options: argparse.Namespace, tally: Tally, seconds: float) -> None:
             "doubled": violations["doubled"], "orphans": violations["orphans"],
             "seed": options.seed, "intruder": options.intruder, "minutes": round(seconds / 60.0, 1),
             "violations_by_kind": dict(violations), "by_kind": dict(sorted(tally.by_kind.items())),
+            "applied": dict(tally.applied), "in_apply": dict(sorted((+tally.in_apply).items())),
             "recovery_s": _spread(tally.recovery), "whole_s": _spread(tally.whole),
             "parted_s": _spread({"owner": tally.parted}), "overloaded": tally.overloaded,
             "load": _spread({"average": tally.loads}),
             "allowed": dict(tally.allowed), "missed": dict(tally.missed), "left_out": left_out,
-            "services": len(list(work.services())) + 1,
+            "services": len([*work.services(), *work.rolled()]) + 1,
             "processes_p50": statistics.median(tally.counts) if tally.counts else None,
             "hosts": len(HOSTS), "lease_s": LEASE_S,
         },

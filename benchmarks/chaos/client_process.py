@@ -1,6 +1,7 @@
 """A client of the master, on its host, driven by lines: `{"do": ...}` in, one line out for each.
 
-`submit` takes the path of a work file, `cancel` names, `migrate` a process and a host. `look`
+`submit` and `apply` take the path of a work file, `cancel` names, `migrate` a process and a host.
+`application` returns the state of an application, and why it returned to its former version. `look`
 returns the states of hosts and processes, for the log of a violation, and the silent hosts by the
 master's events, which confirm a measured stall. The client ends when its input ends.
 """
@@ -37,6 +38,12 @@ def main() -> None:
 def _answer(client: Client, request: dict[str, Any]) -> dict[str, Any]:
     if request["do"] == "submit":
         return {"message": client.submit(request["work"])}
+    if request["do"] == "apply":
+        return {"message": client.apply(request["work"]).message}
+    if request["do"] == "application":
+        row = client.get_application(request["name"])
+        returned = "" if row.returned_from is None else row.returned_from.given_up
+        return {"state": row.state, "returned": returned, "pending": dict(row.pending)}
     if request["do"] == "cancel":
         return {"message": client.cancel(request["names"])}
     if request["do"] == "migrate":

@@ -64,6 +64,10 @@ _JOB: Final = (0.2, 3.0)
 _JOBS: Final = (2, 5)
 _LINE: Final = (0, 3)
 _MOVES: Final = {0: 3, 1: 4, 2: 1}
+#: Versions of the application that are applied: "": none; one that does not run is "faulty".
+_VERSIONS: Final = {"": 2, "good": 4, "faulty": 1}
+#: Seconds from the request of a version to the first fault, at most.
+_LEAD: Final = 6.0
 #: Share of the rounds in which a service is cancelled and another one submitted.
 _RENEWED: Final = 0.3
 
@@ -112,6 +116,8 @@ class Round:
         moves: migrations that are requested during the faults.
         jobs, line: seconds that each job takes, and each of those that wait in line.
         renews: the guest, a service, is cancelled, and another one submitted.
+        version: of the application that is applied before: "good", "faulty" or "" for none.
+        lead: seconds between that request and the first fault.
     """
 
     number: int
@@ -120,6 +126,8 @@ class Round:
     jobs: tuple[float, ...]
     line: tuple[float, ...]
     renews: bool
+    version: str = ""
+    lead: float = 0.0
 
 
 def draw(
@@ -145,7 +153,9 @@ def draw(
             for _ in range(count)
         )
         jobs, line = _seconds(chance, _JOBS), _seconds(chance, _LINE)
-        yield Round(number, faults, moves, jobs, line, chance.random() < _RENEWED)
+        renews, version = chance.random() < _RENEWED, _weighted(chance, _VERSIONS)
+        lead = chance.uniform(0.0, _LEAD) if version else 0.0
+        yield Round(number, faults, moves, jobs, line, renews, version, lead)
 
 
 def _burst(

@@ -24,10 +24,35 @@ FRESH: Final = 1.0
 
 
 @dataclass
+class Versions:
+    """The versions of the application between two judgements.
+
+    Attributes:
+        processes: names of its processes.
+        former: that ran before.
+        newest: that was requested.
+        returned: why the application returned to `former`, as it reports; "": it did not.
+        repeated: the request was sent twice, so the application may have returned in between.
+    """
+
+    processes: tuple[str, ...] = ()
+    former: int = 0
+    newest: int = 0
+    returned: str = ""
+    repeated: bool = False
+
+    @property
+    def expected(self) -> int:
+        """Return the version that all processes have in the end."""
+        return self.former if self.returned else self.newest
+
+
+@dataclass
 class AcceptedRequests:
     """The accepted requests.
 
     Attributes:
+        versions: of the application.
         services: guarantees by name.
         jobs: by name, the time of their acceptance.
         line: jobs that run one after the other, in the order of submission.
@@ -38,6 +63,7 @@ class AcceptedRequests:
     jobs: dict[str, float] = field(default_factory=dict)
     line: list[str] = field(default_factory=list)
     canaries: dict[str, str] = field(default_factory=dict)
+    versions: Versions = field(default_factory=Versions)
 
 
 @dataclass(frozen=True)
@@ -91,7 +117,17 @@ class Oracle:
             Deviation("orphans", name, f"{name} was not requested, and runs: {_listed(left)}")
             for name, left in there.items()
         ]
+        found += self._about_versions(now)
         return found
+
+    def _about_versions(self, now: float) -> Iterator[Deviation]:
+        versions = self._accepted.versions
+        for name in versions.processes:
+            for run in self._outputs.read(name):
+                if run.last > now - FRESH and run.version != versions.expected:
+                    why = f"returned: {versions.returned}" if versions.returned else "not returned"
+                    text = f"{name} is not at version {versions.expected} ({why}): {run}"
+                    yield Deviation("versions", name, text)
 
     def _about_service(
         self, name: str, guarantees: Guarantees, there: list[Member], now: float
@@ -146,7 +182,7 @@ class Oracle:
         Args:
             disturbances: of the lab in that time.
         """
-        judged = Judgement()
+        judged, versions = Judgement(), self._accepted.versions
         reached = {
             host: runs[0].born
             for host, name in self._accepted.canaries.items()
@@ -155,6 +191,11 @@ class Oracle:
         for name, guarantees in self._accepted.services.items():
             chain = rules.chain(self._outputs.read(name))
             judged.add(rules.judge_service(name, guarantees, chain, disturbances, reached))
+            if name in versions.processes:
+                judged.violations += rules.judge_versions(
+                    name, chain, versions.former, versions.newest,
+                    may_return=bool(versions.returned) or versions.repeated,
+                )  # fmt: skip
             if chain:
                 self._outputs.forget(name, before=chain[-1].word_at)
         for name, accepted in self._accepted.jobs.items():

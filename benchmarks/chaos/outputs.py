@@ -19,6 +19,7 @@ class Run:
         first_number, last_number: the numbers in those lines.
         word, word_at: word and time of its last line.
         backwards: how often a number did not exceed the one before.
+        version: of its application; 0: it has none.
     """
 
     instance: str
@@ -32,6 +33,7 @@ class Run:
     word: str = ""
     word_at: float = 0.0
     backwards: int = 0
+    version: int = 0
 
     def take(self, time: float, word: str, number: int) -> None:
         """Add a line."""
@@ -47,7 +49,8 @@ class Run:
     def __str__(self) -> str:
         active = f"active {self.first:.2f}..{self.last:.2f}" if self.first else "never active"
         numbers = f"numbers {self.first_number}..{self.last_number}"
-        return f"{self.instance} pid {self.pid} on {self.host} ({active}, {numbers}, {self.word})"
+        what = f"{self.instance} version {self.version}" if self.version else self.instance
+        return f"{what} pid {self.pid} on {self.host} ({active}, {numbers}, {self.word})"
 
 
 @dataclass
@@ -80,11 +83,13 @@ class Outputs:
         known.offset += len(new)
         *lines, known.rest = (known.rest + new).split(b"\n")
         for line in lines:
-            time, instance, host, pid, born, word, number = line.decode().split()
+            time, instance, host, pid, born, version, word, number = line.decode().split()
             key = (instance, host, pid, born)
             run = known.runs.get(key)
             if run is None:
-                run = known.runs[key] = Run(instance, host, int(pid), float(born))
+                run = known.runs[key] = Run(
+                    instance, host, int(pid), float(born), version=int(version)
+                )  # fmt: skip
             run.take(float(time), word, int(number))
         return sorted(known.runs.values(), key=lambda run: run.born)
 

@@ -20,15 +20,18 @@ RATE = 10.0
 class Lines:
     """The file of this process; its lines survive the end of the process.
 
-    A line: monotonic time, instance, host, pid, time of birth, word, number. The monotonic clock is
-    the same on all hosts of a lab.
+    A line: monotonic time, instance, host, pid, time of birth, version, word, number. The
+    monotonic clock is the same on all hosts of a lab. A faulty version ends before its first line.
     """
 
     def __init__(self) -> None:
+        if "CHAOS_FAULTY" in os.environ:
+            sys.exit(3)
         path = os.path.join(os.environ["CHAOS_LINES"], os.environ["ROSRM_PROCESS"])  # noqa: PTH118
         self._file = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
         instance, born = os.environ["ROSRM_INSTANCE"], time.monotonic()
-        self._head = f"{instance} {socket.gethostname()} {os.getpid()} {born:.4f}"
+        version = os.environ.get("CHAOS_VERSION", "0")
+        self._head = f"{instance} {socket.gethostname()} {os.getpid()} {born:.4f} {version}"
         self.write("born")
 
     def write(self, word: str, number: int = 0) -> None:

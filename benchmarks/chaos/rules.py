@@ -160,6 +160,23 @@ def _judge_state(
     return Judgement([Violation("state", name, text)])
 
 
+def judge_versions(
+    name: str, chained: Sequence[Run], former: int, newest: int, *, may_return: bool
+) -> list[Violation]:
+    """Return a violation if a process of an application went through other versions than asked.
+
+    Args:
+        former: that ran before.
+        newest: that was requested.
+        may_return: the application went back, so that `former` may follow `newest`.
+    """
+    versions = [run.version for run in chained]
+    if {*versions} <= {former, newest} and (may_return or versions == sorted(versions)):
+        return []
+    text = f"{name}: version {newest} was to follow {former}: {'; '.join(map(str, chained))}"
+    return [Violation("versions", name, text)]
+
+
 def judge_job(
     name: str, accepted: float, runs: Sequence[Run], disturbances: Sequence[Disturbance]
 ) -> Judgement:

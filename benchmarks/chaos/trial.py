@@ -19,6 +19,7 @@ from benchmarks.chaos.event_log import EventLog
 from benchmarks.chaos.fault_injector import FaultInjector
 from benchmarks.chaos.faults import Fault, Move, Round
 from benchmarks.chaos.oracle import AcceptedRequests, Deviation, Oracle
+from benchmarks.chaos.rollout import Rollout
 from benchmarks.chaos.rules import Violation
 from benchmarks.chaos.stalls import StallWatch, before_fences, confirmed, read_fences
 from benchmarks.machine import say
@@ -55,6 +56,9 @@ class Tally:
         recovery: seconds from the undoing of the last fault of a round until all was well, by kind
             of the fault, or "burst" for rounds of several kinds.
         whole: the same, from the first fault on.
+        applied: versions of the application: "good" and "faulty" ones, and those that it
+            "returned" from.
+        in_apply: faults that were done while a version was being applied, by kind.
         loads: load average of the machine at the end of each round.
         counts: live processes at each look, from the first round on.
         overloaded: rounds with a stall in which the master recorded the host as silent, or the host
@@ -66,6 +70,8 @@ class Tally:
     violations: Counter[str] = field(default_factory=Counter)
     allowed: Counter[str] = field(default_factory=Counter)
     parted: list[float] = field(default_factory=list)
+    applied: Counter[str] = field(default_factory=Counter)
+    in_apply: Counter[str] = field(default_factory=Counter)
     recovery: dict[str, list[float]] = field(default_factory=dict)
     whole: dict[str, list[float]] = field(default_factory=dict)
     loads: list[float] = field(default_factory=list)
@@ -106,18 +112,23 @@ class Trial:
         self._fault_injector = FaultInjector(cluster)
         self._oracle = Oracle(cluster.lab.name, lines, self._accepted)
         self._disturbances: list[Disturbance] = []
-        self._services = {service.name: service for service in work.services()}
+        self._services = {one.name: one for one in (*work.services(), *work.rolled())}
+        self._rollout = Rollout(
+            client_load, cluster.folder, lines, self._accepted.versions, event_log.add
+        )
         self._guests = self._works = 0
 
     # --- begin and end ------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Submit the services, and wait until all is well."""
-        entries = [one.entry(self._lines) for one in self._services.values()]
+        """Submit the services, apply the application, and wait until all is well."""
+        entries = [one.entry(self._lines) for one in work.services()]
         guarantees = {name: guarantees_of(service) for name, service in self._services.items()}
         self._submit(entries, lambda _: self._accepted.services.update(guarantees))
+        self._rollout.apply(faulty=False)
         self._await_well(0, "the beginning", _BEGIN_S)
         self._oracle.history([])
+        self._rollout.close()
         self._stall_watch.take()
         self._oracle.counts = self._tally.counts
 
@@ -144,7 +155,9 @@ class Trial:
         self._submit_jobs(drawn)
         if drawn.renews:
             self._renew()
-        number, begun = drawn.faults[-1].number, time.monotonic()
+        if drawn.version:
+            self._apply(drawn.version)
+        number, begun = drawn.faults[-1].number, time.monotonic() + drawn.lead
         done = self._do(drawn, begun)
         self._submit_canaries(drawn.number)
         healed = time.monotonic()
@@ -152,6 +165,8 @@ class Trial:
         self._disturbances += self._fault_injector.take_done()
         self._note_stalls()
         judged = self._oracle.history(self._disturbances)
+        self._tally.applied["returned"] += bool(self._accepted.versions.returned)
+        self._rollout.close()
         # A migration may outlast its round.
         recent = time.monotonic() - _MOVE
         self._disturbances = [
@@ -208,6 +223,7 @@ class Trial:
                 self._tally.missed[f"{fault.kind}: {why_not}"] += 1
                 return
             self._tally.by_kind[fault.kind] += 1
+            self._tally.in_apply[fault.kind] += not self._rollout.is_settled
             done.append(fault)
             due.append((begun + fault.at + fault.lasts, lambda: end(fault)))
 
@@ -217,9 +233,9 @@ class Trial:
             else:
                 due.append((time.monotonic() + _LOOK, lambda: end(fault)))
 
-        until = max(fault.at + fault.lasts for fault in drawn.faults)
+        until = drawn.lead + max(fault.at + fault.lasts for fault in drawn.faults)
         due: list[tuple[float, Callable[[], object]]] = [
-            *((begun + second, self._oracle.look) for second in range(int(until) + 1)),
+            *((time.monotonic() + second, self._look) for second in range(int(until) + 1)),
             *((begun + one.at, lambda one=one: begin(one)) for one in drawn.faults),
             *((begun + one.at, lambda one=one: self._move(one)) for one in drawn.moves),
         ]
@@ -232,6 +248,10 @@ class Trial:
                 time.sleep(min(_LOOK, max(0.0, due[0][0] - time.monotonic())))
         return done
 
+    def _look(self) -> None:
+        self._oracle.look()
+        self._rollout.look()
+
     def _tend(self) -> bool:
         self._cluster.tend()
         return self._client_load.collect()
@@ -240,7 +260,8 @@ class Trial:
         """Wait until all is well; return the time since which it has been."""
         deadline, since, steady = time.monotonic() + timeout, 0.0, 0
         while steady < _STEADY:
-            answered = self._tend()
+            answered = self._tend() and self._rollout.is_settled
+            self._rollout.look()
             looked = time.monotonic()
             deviations = self._oracle.deviations()
             if answered and not deviations:
@@ -322,11 +343,13 @@ class Trial:
 
         return accept
 
+    def _apply(self, version: str) -> None:
+        self._tally.applied[version] += 1
+        self._disturbances += [_replacement(one) for one in work.rolled()]
+        self._rollout.apply(faulty=version == "faulty")
+
     def _move(self, move: Move) -> None:
-        sort = self._services[move.process].sort
-        kind = "overlap" if sort.strategy == "relaunch" else "move"
-        now = time.monotonic()
-        self._disturbances.append(Disturbance(kind, now, now, process=move.process))
+        self._disturbances.append(_replacement(self._services[move.process]))
         self._event_log.add(f"{move.process} is requested to migrate to {move.host}")
 
         def answered(client_request: ClientRequest) -> None:
@@ -343,7 +366,7 @@ class Trial:
         words = f"not within {timeout:g} s after {what}"
         violations = [
             Violation(one.kind, one.name, f"{one.text} ({words})") for one in deviations
-        ] or [Violation("lost", "", f"the master has not answered every request, {words}")]
+        ] or [Violation("lost", "", f"a request is not answered or carried out, {words}")]
         if answered or deviations:
             self._event_log.add(f"stuck: {words}")
         self._violated(number, violations)
@@ -358,6 +381,7 @@ class Trial:
         seen: Mapping[str, Any] = {
             "runs": self._oracle.newest_runs(names),
             "disturbances": [_plain(disturbance) for disturbance in self._disturbances],
+            "application": self._rollout.state,
             "master": self._ask_master(),
         }  # fmt: skip
         self._event_log.keep(folder, self._cluster, [asdict(one) for one in violations], seen)
@@ -381,6 +405,13 @@ def guarantees_of(service: work.Service) -> Guarantees:
         sort.members, sort.stateful, sort.standby, service.elsewhere, service.isolated,
         kept=sort.stateful, copied=work.COPIED if sort.stateful else 0,
     )  # fmt: skip
+
+
+def _replacement(service: work.Service) -> Disturbance:
+    """Return the disturbance of a process by a migration or a new version, requested now."""
+    now = time.monotonic()
+    kind = "overlap" if service.sort.strategy == "relaunch" else "move"
+    return Disturbance(kind, now, now, process=service.name)
 
 
 def _plain(disturbance: Disturbance) -> dict[str, Any]:

@@ -29,6 +29,10 @@ ISOLATED: Final = 1
 #: Of the speakers and of the counters, the first so many have a health check: they must publish.
 WATCHED: Final = 1
 
+#: The application that gets new versions, and the seconds for which a new instance must run.
+APPLICATION: Final = "rolling"
+_HEALTHY: Final = 1.0
+
 #: Cycles by which a replica on another host may be behind: snapshots are sent once a second.
 COPIED: Final = 30
 
@@ -121,6 +125,26 @@ def guest(number: int) -> Service:
     """Return a guest: a service that is cancelled when the next guest is submitted."""
     sort = (_SORTS["plain"], _SORTS["counter"], _SORTS["tree"])[number % 3][0]
     return Service(f"guest{number}", sort, elsewhere=bool(number % 2))
+
+
+def rolled() -> Iterator[Service]:
+    """Yield the processes of the application that gets new versions: one of each way to replace."""
+    for word in ("plain", "speaker", "counter"):
+        yield Service(f"{APPLICATION}_{word}", _SORTS[word][0])
+
+
+def version(number: int, lines: Path, faulty: str = "") -> dict[str, Any]:
+    """Return the work file of a version of the application.
+
+    Args:
+        faulty: name of the process that ends at its start; "": none.
+    """
+    entries = [one.entry(lines) for one in rolled()]
+    for entry in entries:
+        entry["environment"]["CHAOS_VERSION"] = str(number)
+        if entry["name"] == faulty:
+            entry["environment"]["CHAOS_FAULTY"] = "yes"
+    return {"app": APPLICATION, "rollout": {"healthy_for": _HEALTHY}, "processes": entries}
 
 
 def job(name: str, lines: Path, seconds: float, *, host: str = "") -> dict[str, Any]:

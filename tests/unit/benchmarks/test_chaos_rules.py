@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +11,16 @@ import pytest
 
 import benchmarks.chaos
 from benchmarks.chaos.allowances import OVERLOAD, Disturbance, Guarantees
+from benchmarks.chaos.oracle import AcceptedRequests, Oracle, Versions
 from benchmarks.chaos.outputs import Outputs, Run
-from benchmarks.chaos.rules import Judgement, chain, judge_job, judge_line, judge_service
+from benchmarks.chaos.rules import (
+    Judgement,
+    chain,
+    judge_job,
+    judge_line,
+    judge_service,
+    judge_versions,
+)
 
 FOLDER = Path(benchmarks.chaos.__file__).parent
 JUDGES = ["oracle.py", "reality.py", "outputs.py", "rules.py", "allowances.py"]
@@ -240,16 +249,44 @@ def test_who_waits_in_line_keeps_its_place():
     assert [(one.kind, one.name) for one in judge_line(line)] == [("order", "three")]
 
 
+@pytest.mark.parametrize(
+    ("versions", "may_return", "violations"),
+    [
+        ([1, 1, 2], False, 0), ([1, 2, 1], False, 1), ([1, 2, 1], True, 0), ([1, 3], True, 1),
+        ([2], False, 0), ([], False, 0),
+    ],
+)  # fmt: skip
+def test_a_version_follows_the_former_one_unless_the_application_returned(
+    versions, may_return, violations
+):
+    """No run has a version that was not requested, and none of the former one comes later."""
+    runs = [replace(run(), version=version) for version in versions]
+    judged = judge_versions("a", runs, 1, 2, may_return=may_return)
+    assert [one.kind for one in judged] == ["versions"] * violations
+
+
+def test_all_processes_have_the_version_that_the_application_reports(tmp_path):
+    """The former version is right if and only if the application returned to it."""
+    versions = Versions(("a",), former=1, newest=2)
+    oracle = Oracle("no-lab", tmp_path, AcceptedRequests(versions=versions))
+    now = time.monotonic()
+    (tmp_path / "a").write_text(f"{now} a#1 host1 5 {now} 1 active 1\n")
+    assert [one.kind for one in oracle.deviations()] == ["versions"]
+    versions.returned = "a: exit code 3"
+    assert oracle.deviations() == []
+
+
 def test_lines_become_runs_as_they_grow(tmp_path):
     """Half a line waits for its rest; a restart under the same name is another run."""
     file, outputs = tmp_path / "a", Outputs(tmp_path)
     assert outputs.read("a") == []
-    file.write_text("1.0 a#1 host1 5 0.9 born 0\n1.1 a#1 host1 5 0.9 active 1\n1.2 a#1 ho")
+    file.write_text("1.0 a#1 host1 5 0.9 7 born 0\n1.1 a#1 host1 5 0.9 7 active 1\n1.2 a#1 ho")
     assert [(one.first, one.last_number) for one in outputs.read("a")] == [(1.1, 1)]
     with file.open("a") as more:
-        more.write("st1 5 0.9 active 2\n3.0 a#1 host1 9 2.9 active 1\n")
+        more.write("st1 5 0.9 7 active 2\n3.0 a#1 host1 9 2.9 0 active 1\n")
     first, second = outputs.read("a")
     assert (first.last, first.last_number, second.pid) == (1.2, 2, 9)
+    assert (first.version, second.version) == (7, 0)
     assert chain([second, first]) == [first, second]
     outputs.forget("a", before=2.0)
     assert outputs.read("a") == [second]
