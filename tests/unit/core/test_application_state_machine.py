@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Assign, Command
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.applications import Action, RolloutPolicy, Target
@@ -233,6 +234,20 @@ class Applications(RuleBasedStateMachine):
         for name in ALL:
             if name not in self.cluster.state.migrations:
                 assert len(self.cluster.where(name)) <= 1, name
+
+    @invariant()
+    def a_settled_application_has_one_version(self) -> None:
+        """Check that an application that reports `running` runs the programs of its version."""
+        state = self.cluster.state
+        for row in application_rows(state):
+            specs = state.applications[row.name].specs
+            for name, spec in specs.items() if row.state == "running" else ():
+                known = state.processes.get(name)
+                if known is None or known.phase is not ProcessPhase.RUNNING:
+                    continue
+                owner = state.instances[known.owner]
+                program = self.cluster.machines[owner.host.name].programs.get(owner.id)
+                assert program is None or program.assignment.spec.command == spec.command, name
 
     @invariant()
     def no_desired_process_is_forgotten(self) -> None:

@@ -644,6 +644,20 @@ def test_an_application_is_judged_once_its_hosts_have_reported_again() -> None:
     )
 
 
+def test_an_application_is_degraded_while_an_old_program_runs_in_it() -> None:
+    """The version before was not reached, so a failure of the new one leads back to none."""
+    cluster = Cluster("a")
+    waiting = process("q", required_labels={"arm": "left"})
+    cluster.apply("nav", process("p"), waiting)
+    cluster.apply("nav", new(process("p", needs={"memory": 1e15})))
+    cluster.wait(5.0)
+    assert (state_of(cluster), program(cluster, "p")) == ((2, []), process("p").command)
+    found = row(cluster)
+    assert (found.state, found.running, found.reason) == (
+        "degraded", 0, "p is still of another version",
+    )  # fmt: skip
+
+
 def test_an_application_is_not_degraded_while_a_process_of_it_moves() -> None:
     """A process that moves to another host runs."""
     cluster = Cluster("a")

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
+from rosrm.core.master.applications.difference import difference_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import ProcessPhase
-from rosrm.model.applications import ApplicationRow, ApplicationState, VersionRow
+from rosrm.model.applications import Action, ApplicationRow, ApplicationState, VersionRow
 from rosrm.wording import few, standing
 
 #: Phases of a process that is as its application wants it; one that moves runs.
@@ -70,12 +71,20 @@ def _why_unwell(state: MasterState, application: Application, name: str) -> str:
     process = state.processes.get(name)
     if process is None or process.spec.application != application.name:
         return "does not exist any more"
+    if name not in application.tasks and _is_of_another_version(state, application, name):
+        return "is still of another version"
     if process.phase in _WELL or process.is_finished_job:
         return ""
     if process.phase is ProcessPhase.FINISHED:
         return "has finished, but is a service: `rosrm apply` starts it again"
     reason = f": {process.reason}" if process.reason else ""
     return f"{standing(process.phase.value)}{reason}"
+
+
+def _is_of_another_version(state: MasterState, application: Application, name: str) -> bool:
+    """Return True if a process that runs was to be replaced, which has failed for good."""
+    difference = difference_of(state, application.name, name, application.specs[name])
+    return difference is not None and difference.action is Action.REPLACE
 
 
 def _version_row(application: Application, version: Version) -> VersionRow:
