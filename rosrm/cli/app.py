@@ -10,17 +10,18 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from typing import TextIO
 
 from rosrm.cli.process import INTERRUPTED
 
 
-def main() -> None:
-    """Run the command line and exit with its code."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command line, by default that of this process, and exit with its code."""
     _open_closed_streams()
     try:
-        _run()
+        _run(sys.argv[1:] if arguments is None else arguments)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 
@@ -34,15 +35,15 @@ def _open_closed_streams() -> None:
             setattr(sys, name, os.fdopen(null, mode, encoding="utf-8"))
 
 
-def _run() -> None:
+def _run(arguments: Sequence[str]) -> None:
     from rosrm.cli import early  # noqa: PLC0415 - see above
 
     try:
-        early.join(sys.argv[1:], os.environ)
+        early.join(arguments, os.environ)
         from rosrm.cli.commands import app, keep_only  # noqa: PLC0415 - see above
 
-        keep_only(sys.argv[1:])
-        app(prog_name="rosrm")
+        keep_only(arguments)
+        app(arguments, prog_name="rosrm")
     except SystemExit as ended:
         early.drop()
         _leave(ended.code)
