@@ -323,6 +323,7 @@ class ClusterConfig:
         network: measurement of links and flows.
         journal: journal of events and intents.
         record: recording of all events that the master receives, for replay.
+        diagnostics: publish the statuses of hosts and processes on `/diagnostics`.
         artifacts: contents of artifacts, which slaves fetch from the master.
         checkpoint: policy that places replicas of snapshots on other hosts, if any.
         delivery_timeout: seconds within which a slave must accept an assignment.
@@ -349,6 +350,7 @@ class ClusterConfig:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
+    diagnostics: bool = True
     artifacts: ArtifactStoreSettings = field(default_factory=ArtifactStoreSettings)
     checkpoint: CheckpointPolicySettings = field(default_factory=CheckpointPolicySettings)
     delivery_timeout: PositiveSeconds = _CORE.delivery_timeout

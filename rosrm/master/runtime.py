@@ -42,6 +42,7 @@ from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys.finding import master_security
 from rosrm.keys.security import Member
+from rosrm.master.diagnostics import DiagnosticsFeed
 from rosrm.master.grants_watch import GrantsWatch
 from rosrm.master.journal_stall import JournalStall
 from rosrm.master.plugin_deadline import Deadlines
@@ -53,6 +54,7 @@ from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.model.rows import PluginRow
 from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.master.artifacts import ArtifactServices
+from rosrm.ros.master.diagnostics import open_diagnostics
 from rosrm.ros.master.endpoint import MasterEndpoint
 from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.master_connection import find_master
@@ -160,6 +162,7 @@ class MasterRuntime:
             opened.callback(self._end_record)
             self._state = self._restored(placement, strategies)
             self._endpoint = self._new_endpoint()
+            self._diagnostics = self._new_diagnostics()
             self._closing = opened.pop_all()
 
     def _refuse_second(self) -> None:
@@ -249,10 +252,18 @@ class MasterRuntime:
             self._config.name, self._state, self._journal, self._plugins,
             uptime=lambda: self._now() - self._started,
             core_now=lambda: self._core_now(self._now()),
-            trouble=lambda: self._held.refusal if self._held is not None else "",
+            trouble=self._trouble,
             has_artifact=store.has,
         )  # fmt: skip
         return MasterEndpoint(self._endpoints, identity, reading, control)
+
+    def _new_diagnostics(self) -> DiagnosticsFeed | None:
+        publish = open_diagnostics(self._participant) if self._config.diagnostics else None
+        return None if publish is None else DiagnosticsFeed(self._state, self._config.name, publish)
+
+    def _trouble(self) -> str:
+        """Return why the master accepts no new work; "" if it does."""
+        return self._held.refusal if self._held is not None else ""
 
     def _now(self) -> float:
         return time.monotonic()
@@ -300,6 +311,8 @@ class MasterRuntime:
                         self._journal.last_sequence,
                     )  # fmt: skip
                 self._take_in(now)
+                if self._diagnostics is not None:
+                    self._diagnostics.advance(now, self._core_now(now), self._trouble())
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
 
@@ -425,6 +438,8 @@ class MasterRuntime:
         for reply in replies:
             if not reply.host_id:
                 self._endpoint.services.reply(reply)
+        if self._diagnostics is not None:
+            self._diagnostics.note(one.record for one in stored)
         for one in stored:
             _log.info("%s", one_line(one.record.message))
 

@@ -12,6 +12,7 @@ orders.py               orders of the master to a slave
 event_kinds.py          the kinds of events in the event record
 records.py              records and intents, and the protocol of a journal
 rows.py                 rows of listings
+diagnostics.py          diagnostic statuses and their levels
 requester.py            sender of a request, and its rights on processes
 ros_settings.py         ROS settings of a part: domain, discovery, transports, interface
 codec.py                conversion of values to JSON and back

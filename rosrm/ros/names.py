@@ -95,3 +95,5 @@ SNAPSHOT_REPORTS: Final = "snapshot_reports"
 MASTER_BEAT: Final = "master_beat"
 MASTER_LOAD: Final = "master_load"
 STATE_CONFIG: Final = "state_config"
+#: Of ROS, below no namespace: monitors of all packages expect it there.
+DIAGNOSTICS: Final = "/diagnostics"

@@ -31,6 +31,8 @@ BEAT: Final = latched(depth=1)
 BEAT_IN: Final = best_effort(depth=1)
 #: For observers of the master's load.
 LOAD: Final = reliable(depth=5)
+#: As the publishers of ROS's own package diagnostic_updater.
+DIAGNOSTICS: Final = reliable(depth=10)
 #: The master's newest messages about every handoff: two for each phase, one for each node.
 STATE_CONFIG: Final = latched(depth=200)
 #: One handoff: a restarted master receives the reports that it has missed.

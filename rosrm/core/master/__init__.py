@@ -12,6 +12,7 @@ lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, s
 start_order.py starts after other processes, stops before them; dependants.py
 consequences.py the end of each step: what a change makes possible or necessary
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py
+diagnostics.py statuses of hosts and processes for `/diagnostics`
 applications/  versions of applications, replacement of processes, plans
 modes/         sets of applications: the one in force, its limits and weights
 scheduling/    choice of a host for a process: filter, score, pick

@@ -42,10 +42,11 @@ _OBSERVED: Final = (ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BA
 
 def host_rows(state: MasterState, now: float) -> list[HostRow]:
     """Return every host, in order of registration."""
-    return [_host_row(state, host, now) for host in state.hosts.listed()]
+    return [host_row(state, host, now) for host in state.hosts.listed()]
 
 
-def _host_row(state: MasterState, host: Host, now: float) -> HostRow:
+def host_row(state: MasterState, host: Host, now: float) -> HostRow:
+    """Return the row of one host."""
     table, column = state.hosts, host.column
     stale = set(table.stale_resources(host))
     condition = table.condition_of(host)

@@ -220,7 +220,7 @@ def test_an_answer_is_compared_but_for_what_differs_each_time(given, same):
 
 TOPICS = {
     "resource_info", "process_status", "process_usage", "snapshot_reports", "master_beat",
-    "master_load", "state_config",
+    "master_load", "state_config", names.DIAGNOSTICS,
 }  # fmt: skip
 NAMES = {value for name, value in vars(names).items() if name.isupper() and isinstance(value, str)}
 OF_A_HOST = {names.CONTROL, names.READ_LOG, names.STORE_REPLICA, names.READ_SNAPSHOT}

@@ -1,0 +1,48 @@
+"""Publisher of `/diagnostics`, the topic of diagnostic statuses in ROS."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+from rosrm.model.diagnostics import Diagnostic
+from rosrm.ros import names, qos
+from rosrm.ros.participant import Participant
+from rosrm.wording import sanitized, sendable
+
+_log = logging.getLogger("rosrm.master")
+
+
+def open_diagnostics(participant: Participant) -> Callable[[Sequence[Diagnostic]], None] | None:
+    """Return a function that publishes statuses; None: this ROS installation has no messages."""
+    try:
+        from diagnostic_msgs import msg  # noqa: PLC0415 - not in every ROS installation
+    except ImportError as fault:
+        _log.warning(
+            "%s is not published: %s. Install the ROS package diagnostic_msgs, or set "
+            "`diagnostics: false`", names.DIAGNOSTICS, fault,
+        )  # fmt: skip
+        return None
+    node = participant.node
+    publisher = node.create_publisher(msg.DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+
+    def status_of(one: Diagnostic) -> msg.DiagnosticStatus:
+        return msg.DiagnosticStatus(
+            level=bytes([one.level]), name=f"rosrm: {' '.join(one.subject)}",
+            message=_text(one.message), hardware_id=one.host,
+            values=[msg.KeyValue(key=key, value=_text(text)) for key, text in one.values.items()],
+        )  # fmt: skip
+
+    def send(statuses: Sequence[Diagnostic]) -> None:
+        message = msg.DiagnosticArray(status=[status_of(one) for one in statuses])
+        message.header.stamp = node.get_clock().now().to_msg()
+        publisher.publish(message)
+
+    def publish(statuses: Sequence[Diagnostic]) -> None:
+        participant.guard.call(send, statuses)
+
+    return publish
+
+
+def _text(text: str) -> str:
+    return sendable(sanitized(text))
