@@ -134,7 +134,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     before, pid = instance.state, instance.pid
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
-    instance.enforced = status.enforced
+    instance.message, instance.enforced = status.message, status.enforced
     _note_load(state, instance, before, now)
     state.note_held(instance, status.devices)
     if status.state.ended:

@@ -22,6 +22,7 @@ from rosrm.model.values import (
     EMPTY,
     InstanceId,
     InstanceState,
+    InstanceStatus,
     MigrationPolicy,
     ProcessSpec,
     RestartPolicy,
@@ -225,6 +226,21 @@ def test_a_destination_that_never_becomes_ready_is_stopped() -> None:
     (said,) = cluster.recorded("stayed")
     assert said == "p stayed on a: waiting until p#2 is ready on b took longer than 10 s"
     assert cluster.state.hosts.processes.tolist() == [1, 0]
+
+
+@pytest.mark.parametrize("overlap", [True, False])
+@pytest.mark.parametrize("reported", [InstanceState.BACKOFF, InstanceState.STARTING])
+def test_a_destination_that_ends_at_its_start_is_not_awaited(reported, overlap) -> None:
+    """The move is undone at the first end of its program, or at the report of a restart."""
+    cluster = two_hosts(overlap=overlap)
+    cluster.migrate("p")
+    cluster.wait(1.0)
+    message = "exit code 3; restart 1 of 5 in 1.0 s"
+    destination = cluster.machines["b"].find("p")
+    cluster.report("b", InstanceStatus(destination, reported, restarts=1, message=message))
+    cluster.wait(1.0)
+    assert cluster.where("p") == ["a"]
+    assert cluster.recorded("stayed") == ["p stayed on a: p#2 ended on b: exit code 3"]
 
 
 def test_a_start_has_more_time_if_it_fetches_artifacts(monkeypatch) -> None:

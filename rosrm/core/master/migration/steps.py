@@ -19,6 +19,7 @@ from rosrm.core.master.outcomes import (
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.pending_orders import MigrationStep
+from rosrm.core.master.state.process import Instance
 from rosrm.model.orders import AmendInstance, Order, RunExecutor, StartInstance, StopInstance
 from rosrm.model.plan import (
     Aim,
@@ -258,19 +259,38 @@ def _of_start(state: MasterState, migration: Migration, step: Start) -> StepOutc
         return StepProgress.PENDING  # another instance must end first
     if answer is not None and not answer.accepted:
         return StepFailed(f"{step.host} refused to start {step.instance}: {answer.reason}")
-    return done_if(instance.is_running)
+    failed = _ended_before_commit(migration, instance)
+    return failed or done_if(instance.is_running)
 
 
 def _of_wait(state: MasterState, migration: Migration, step: AwaitReady, now: float) -> StepOutcome:
     instance = state.instances.get(step.instance.number)
     if instance is None:
         return _ended(migration, step)
-    return done_if(instance.state is InstanceState.READY and now >= instance.ready_at + step.settle)
+    failed = _ended_before_commit(migration, instance)
+    return failed or done_if(
+        instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
+    )
 
 
 def _ended(migration: Migration, step: Start | AwaitReady) -> StepFailed:
     how = migration.how_ended(step.instance)
     return StepFailed(f"{step.instance} ended on {step.host}: {how}")
+
+
+def _ended_before_commit(migration: Migration, instance: Instance) -> StepFailed | None:
+    """Return the failure of a destination whose program has ended, although its slave restarts it.
+
+    The source still runs or can start again, so a program that ends at its start is not repeated
+    until the time-out.
+    """
+    is_repeated = instance.state is InstanceState.BACKOFF or instance.restarts
+    if not is_repeated or instance.id != migration.destination:
+        return None
+    if migration.committed or migration.undo is not None:
+        return None
+    why = instance.message.partition("; restart ")[0] or "it was restarted"
+    return StepFailed(f"{instance.id} ended on {instance.host.name}: {why}")
 
 
 def _of_restart_policy(state: MasterState, migration: Migration, step: SetRestart) -> StepOutcome:

@@ -81,6 +81,7 @@ class Instance:
         state: state that the slave has reported last; None: assigned, without a report yet.
         seen: newest usage in base units; also of resources that are not attributed, if measured.
         peak: highest usage in base units.
+        message: text of its slave's newest report, e.g. how its program ended.
         restarting: the slave was ordered to restart it, and no report shows the restart yet.
         settled: its estimates no longer count.
         shown: the readings show its load of shared resources, which no longer counts.
@@ -104,6 +105,7 @@ class Instance:
     state: InstanceState | None = None
     pid: int = 0
     restarts: int = 0
+    message: str = ""
     seen: dict[str, float] = field(default_factory=dict)
     peak: dict[str, float] = field(default_factory=dict)
     stopping: bool = False
