@@ -34,7 +34,11 @@ CRIU = VENV / "criu"  # the same path as in tests/conftest.py and the Makefile
 INSTALL_CRIU = ROOT / "scripts" / "install_criu.sh"
 LOG = VENV / "setup.log"
 STAMP = VENV / "rosrm-setup.json"
-INTERFACES = ROOT / "rosrm_msgs"
+#: Packages of ROS interfaces, and what is said of each.
+INTERFACES = {
+    ROOT / "rosrm_msgs": "the ROS interfaces: generated and compiled, about a minute",
+    ROOT / "composition_interfaces": "the services of component containers: the same, half as long",
+}
 CONSTRAINTS = ROOT / "constraints.txt"
 
 #: The Python versions with ROS 2 Jazzy wheels.
@@ -89,7 +93,11 @@ def wait_for(lock: int) -> None:
 def set_up(*, remake_other_version: bool, tests: bool) -> None:
     """Run the unfinished steps."""
     packages = packages_digest()
-    wanted = {"where": str(VENV), "interfaces": interfaces_digest(), "packages": packages}
+    wanted = {
+        "where": str(VENV),
+        "interfaces": interfaces_digest(*INTERFACES),
+        "packages": packages,
+    }
     if tests:
         wanted["tests"] = packages
     if not venv_usable(remake_other_version=remake_other_version):
@@ -103,7 +111,8 @@ def set_up(*, remake_other_version: bool, tests: bool) -> None:
     steps = Steps()
     steps.run("pip and the build backends", *pip("install", *BACKENDS))
     if "interfaces" in missing:
-        install_interfaces(steps, wanted["interfaces"])
+        for source, what in INTERFACES.items():
+            install_interfaces(steps, source, what)
         stamp(wanted, "interfaces")
     if "packages" in missing:
         steps.run(
@@ -122,26 +131,23 @@ def set_up(*, remake_other_version: bool, tests: bool) -> None:
     print(f"      .venv is ready ({time.monotonic() - began:.0f} s in all)", flush=True)
 
 
-def install_interfaces(steps: Steps, content: str) -> None:
-    """Install the compiled ROS interfaces, from the cache if they were built before.
-
-    Args:
-        content: digest of all that the build reads.
-    """
+def install_interfaces(steps: Steps, source: Path, what: str) -> None:
+    """Install compiled ROS interfaces, from the cache if they were built before."""
+    content = interfaces_digest(source)
     folder = cache_folder() / f"{content[:16]}-{sysconfig.get_platform()}-{short_version()}"
     if not any(folder.glob("*.whl")):
         with tempfile.TemporaryDirectory(dir=folder.parent) as built:
             steps.run(
-                "the ROS interfaces: generated and compiled, about a minute",
+                what,
                 *pip("wheel", "--no-deps", "--build-constraint", CONSTRAINTS),
-                *("--verbose", "--wheel-dir", built, INTERFACES),  # for the progress
+                *("--verbose", "--wheel-dir", built, source),  # for the progress
             )
             wheel = next(Path(built).glob("*.whl"))
             folder.mkdir(exist_ok=True)
             wheel.replace(folder / wheel.name)  # whole, or not at all
     wheel = next(folder.glob("*.whl"))
     steps.run(
-        "the compiled ROS interfaces",
+        f"compiled: {source.name}",
         *pip("install", "--force-reinstall", "--no-deps", wheel),
     )
 
@@ -172,10 +178,15 @@ def try_criu(steps: Steps) -> None:
 # ----------------------------------------------------------------------------- present state
 
 
-def interfaces_digest() -> str:
-    """Return a digest of all files that the build of rosrm_msgs reads."""
-    files = [p for p in INTERFACES.rglob("*") if p.is_file() and "__pycache__" not in p.parts]
-    return digest([*files, CONSTRAINTS])
+def interfaces_digest(*sources: Path) -> str:
+    """Return a digest of all files that the builds of these packages read."""
+    files = [
+        path
+        for source in (*sources, ROOT / "rosrm_msgs" / "cmake")
+        for path in source.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    ]
+    return digest([*set(files), CONSTRAINTS])
 
 
 def packages_digest() -> str:

@@ -132,6 +132,7 @@ for module in (up, runtimes, applications, modes, change, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
 app.command(cls=PlainCommand, context_settings={"allow_interspersed_args": False})(run.run)
+app.command(cls=PlainCommand, context_settings={"ignore_unknown_options": True})(runtimes.container)
 add_command(app, "config", check.config)
 add_command(app, "key", key.key)
 add_command(app, "plugin", plugin.plugin)

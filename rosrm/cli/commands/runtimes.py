@@ -109,6 +109,23 @@ def slave(
     become("rosrm.slave", settings.to_json(), _source("slave", config, ctx, domain))
 
 
+def container(
+    arguments: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="ARGUMENTS",
+            help="Arguments of the node, as in `ros2 run`: --ros-args -r __node:=NAME ...",
+        ),
+    ] = None,
+) -> None:
+    """Start a component container for nodes in Python.
+
+    `ros2 component load` and launch files load into it; Ctrl-C ends it with all its components.
+    """
+    words = [sys.executable, "-m", "rosrm.node.container", *(arguments or [])]
+    os.execv(sys.executable, words)  # noqa: S606 - no shell is wanted
+
+
 def become(module: str, settings: str, source: SettingsSource) -> None:
     """Replace this process by a runtime."""
     descriptor = hand_over(settings, source)

@@ -1,0 +1,172 @@
+"""A component container for nodes in Python: several nodes in one process with one participant.
+
+It has the services of a container of rclcpp (`load_node`, `unload_node` and `list_nodes` below
+`~/_container`), so `ros2 component` and launch files use it as one. A component is a class whose
+constructor passes its keyword arguments on to rclpy's `Node`:
+
+    class Talker(Node):
+        def __init__(self, **options):
+            super().__init__("talker", **options)
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any, Final
+
+import rclpy
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.logging import LoggingSeverity
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+try:
+    from composition_interfaces import srv
+except ModuleNotFoundError as missing:
+    raise SystemExit(
+        "rosrm container: the ROS package composition_interfaces is missing. Install "
+        "ros-$ROS_DISTRO-composition-interfaces by apt; with the ROS wheels, "
+        "`pip install ./composition_interfaces` in the source of rosrm"
+    ) from missing
+
+#: Entry points of components that their packages declare.
+GROUP: Final = "rclpy_components"
+_SERVICES: Final = "~/_container"
+
+
+class Container:
+    """The nodes of one container, and its services.
+
+    Args:
+        executor: runs the callbacks of all nodes.
+    """
+
+    def __init__(self, executor: SingleThreadedExecutor) -> None:
+        self.node = Node("container")
+        self._executor = executor
+        self._components: dict[int, Node] = {}
+        self._newest = 0
+        executor.add_node(self.node)
+        self.node.create_service(srv.LoadNode, f"{_SERVICES}/load_node", self._load)
+        self.node.create_service(srv.UnloadNode, f"{_SERVICES}/unload_node", self._unload)
+        self.node.create_service(srv.ListNodes, f"{_SERVICES}/list_nodes", self._list)
+
+    def close(self) -> None:
+        """Destroy all nodes."""
+        for node in (*self._components.values(), self.node):
+            node.destroy_node()
+
+    def _load(self, request: Any, response: Any) -> Any:
+        """Load a component; the answer says why that failed."""
+        try:
+            node = self._made(request)
+        except Exception as error:  # noqa: BLE001 - whatever the component raises is its answer
+            response.error_message = f"{request.plugin_name}: {type(error).__name__}: {error}"
+            self.node.get_logger().error(f"cannot load {response.error_message}")
+            return response
+        self._newest += 1
+        self._components[self._newest] = node
+        self._executor.add_node(node)
+        response.success, response.unique_id = True, self._newest
+        response.full_node_name = node.get_fully_qualified_name()
+        return response
+
+    def _made(self, request: Any) -> Node:
+        """Return the node of a component.
+
+        Raises:
+            ValueError: there is no such component, or a component of its name is loaded already.
+            TypeError: it is no node of rclpy.
+        """
+        component = find_component(request.package_name, request.plugin_name)
+        overrides = [Parameter.from_parameter_msg(one) for one in request.parameters]
+        node = component(
+            cli_args=_arguments(request), use_global_arguments=False, parameter_overrides=overrides
+        )
+        if not isinstance(node, Node):
+            raise TypeError(f"it makes a {type(node).__name__}, not a node of rclpy")
+        name = node.get_fully_qualified_name()
+        if name in map(Node.get_fully_qualified_name, self._components.values()):
+            node.destroy_node()
+            raise ValueError(f"a component {name} is loaded already; give this one another name")
+        if request.log_level:
+            node.get_logger().set_level(LoggingSeverity(request.log_level))
+        return node
+
+    def _unload(self, request: Any, response: Any) -> Any:
+        """Destroy a component."""
+        node = self._components.pop(request.unique_id, None)
+        if node is None:
+            loaded = ", ".join(map(str, self._components)) or "none"
+            response.error_message = f"no component {request.unique_id}; loaded: {loaded}"
+            return response
+        self._executor.remove_node(node)
+        node.destroy_node()
+        response.success = True
+        return response
+
+    def _list(self, _request: Any, response: Any) -> Any:
+        """List the components."""
+        response.unique_ids = list(self._components)
+        names = map(Node.get_fully_qualified_name, self._components.values())
+        response.full_node_names = list(names)
+        return response
+
+
+def find_component(package: str, plugin: str) -> Callable[..., Any]:
+    """Return a component by the name that its package declares, or as "module:Class".
+
+    Raises:
+        ValueError: there is none, or the name fits several packages.
+    """
+    declared = [
+        one for one in entry_points(group=GROUP, name=plugin)
+        if not package or (one.dist is not None and _same(one.dist.name, package))
+    ]  # fmt: skip
+    if len(declared) > 1:
+        raise ValueError(f"several packages have a component {plugin}; name one of them")
+    if declared:
+        return declared[0].load()  # type: ignore[no-any-return]  # entry points have no types
+    module, colon, name = plugin.partition(":")
+    if not colon:
+        of = f" of the package {package}" if package else ""
+        raise ValueError(f"no entry point {plugin!r}{of} in {GROUP}, and no name as module:Class")
+    found: Callable[..., Any] | None = getattr(import_module(module), name, None)
+    if found is None:
+        raise ValueError(f"{module} has no class {name}")
+    return found
+
+
+def _same(distribution: str, package: str) -> bool:
+    return distribution.replace("-", "_").lower() == package.lower()
+
+
+def _arguments(request: Any) -> list[str]:
+    """Return the command line of a component's node."""
+    rules = list(request.remap_rules)
+    if request.node_name:
+        rules.append(f"__node:={request.node_name}")
+    if request.node_namespace:
+        rules.append(f"__ns:={request.node_namespace}")
+    return ["--ros-args", *(word for rule in rules for word in ("-r", rule))]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a container until a signal ends it."""
+    rclpy.init(args=sys.argv if arguments is None else ["container", *arguments])
+    executor = SingleThreadedExecutor()
+    container = Container(executor)
+    try:
+        with suppress(KeyboardInterrupt, ExternalShutdownException):  # the usual ends of a node
+            executor.spin()
+    finally:
+        container.close()
+        rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()

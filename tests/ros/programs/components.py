@@ -1,0 +1,33 @@
+"""Components for tests of `rosrm container`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rclpy.node import Node
+from std_msgs.msg import String
+
+
+class Talker(Node):
+    """Publishes its parameter `says` at 20 Hz."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("talker", **options)
+        says = self.declare_parameter("says", "nothing")
+        output = self.create_publisher(String, "words", 10)
+        self.create_timer(0.05, lambda: output.publish(String(data=says.value)))
+
+
+class Broken(Node):
+    """Cannot be made."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("broken", **options)
+        self.destroy_node()
+        raise OSError("no device here")
+
+
+class Plain:
+    """A class that is no node."""
+
+    def __init__(self, **options: Any) -> None: ...
