@@ -43,7 +43,7 @@ class RestartInstance:
     instance: InstanceId
 
 
-#: A slave's code of the refusal of an `AmendInstance`.
+#: A slave's code of the refusal of an `AmendInstance` for an instance that it knows.
 NOT_AMENDED: Final = "not_amended"
 
 

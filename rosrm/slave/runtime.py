@@ -88,8 +88,8 @@ _MASTER_PATIENCE: Final = 5.0
 
 #: Takes a summary of reloaded settings, or why they cannot be used; the other one is "".
 ReloadDone = Callable[[str, str], None]
-#: Takes the outcome of an order: the reason of a refusal; "": the order was executed.
-Settled = Callable[[str], None]
+#: Takes the outcome of an order: the reason of a refusal, and its code; "": the order was executed.
+Settled = Callable[[str, str], None]
 
 
 class SlaveRuntime:
@@ -505,7 +505,7 @@ class SlaveRuntime:
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
         elif isinstance(command, commands.Settle):
             for settled in self._unsettled.pop((command.instance, command.amendment), []):
-                settled(command.refusal)
+                settled(command.refusal, command.code)
         else:
             self._have_supervisor(command)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rosrm.core.slave.watches import Memo
+from rosrm.model.orders import NOT_AMENDED
 from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
 
 
@@ -76,11 +77,17 @@ class Amend:
 
 @dataclass(frozen=True, slots=True)
 class Settle:
-    """Answer the order to change an instance; `refusal`: why that failed; "": success."""
+    """Answer the order to change an instance.
+
+    Attributes:
+        refusal: why nothing has changed; "": it has, or the instance has ended.
+        code: of the refusal.
+    """
 
     instance: InstanceId
     amendment: Amendment
     refusal: str = ""
+    code: str = NOT_AMENDED
 
 
 @dataclass(frozen=True, slots=True)

@@ -228,7 +228,7 @@ def _pause_or_watch(held: HeldInstance, restart: RestartPolicy) -> bool:
 
 def _unknown(order: events.AmendmentOrdered) -> commands.Settle:
     never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
-    return commands.Settle(order.instance, order.amendment, never)
+    return commands.Settle(order.instance, order.amendment, never, "unknown")
 
 
 def _amendment_recorded(

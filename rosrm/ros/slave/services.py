@@ -13,7 +13,6 @@ from rosrm.errors import Refused
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
 from rosrm.model.orders import (
-    NOT_AMENDED,
     AmendInstance,
     DropReplica,
     MeasureLinks,
@@ -70,7 +69,8 @@ class Duties:
     Attributes:
         take: takes an event for the core.
         amend: changes an instance that runs on. It calls its last argument with "" when the change
-            is durable, whichever process is killed, else with the reason why nothing has changed.
+            is durable, whichever process is killed, else with the reason why nothing has changed,
+            and its code.
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
         drop_snapshots: deletes the snapshots of a process, of instances up to this one.
         execute: runs an executor, and calls its last argument with the outcome. If that takes
@@ -82,7 +82,7 @@ class Duties:
     """
 
     take: Callable[[Event], None]
-    amend: Callable[[AmendInstance, Callable[[str], None]], None]
+    amend: Callable[[AmendInstance, Callable[[str, str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
@@ -141,8 +141,8 @@ class SlaveServices:
         respond(srv.ControlHost.Response(answer=accepted()))
 
     def _amend(self, order: AmendInstance, respond: Callable[[Any], None]) -> None:
-        def settled(refusal: str) -> None:
-            answer = refused(NOT_AMENDED, refusal) if refusal else accepted()
+        def settled(refusal: str, code: str) -> None:
+            answer = refused(code, refusal) if refusal else accepted()
             respond(srv.ControlHost.Response(answer=answer))
 
         self._duties.amend(order, settled)

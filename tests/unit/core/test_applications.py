@@ -147,6 +147,25 @@ def test_limits_that_the_slave_refuses_lead_back() -> None:
     assert not cluster.state.unamended
 
 
+def test_a_change_may_overtake_the_assignment() -> None:
+    """The slave does not know the instance yet, which is no fault of the new version."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    cluster.wait(2.0)
+    machine = cluster.machines["a"]
+    machine.connected = False
+    cluster.apply("nav", process("p"), process("q"))
+    late, machine.polled = machine.polled, []
+    machine.connected = True
+    cluster.apply("nav", process("p"), process("q", restart=RestartPolicy("always")))
+    cluster.wait(0.5)
+    machine.polled = late
+    cluster.wait(5.0)
+    assert (cluster.phase("q"), state_of(cluster)) == ("running", (3, []))
+    (held,) = [one for key, one in machine.programs.items() if key.process == "q"]
+    assert held.restart == RestartPolicy("always")
+
+
 def test_a_process_in_the_queue_gets_its_new_spec() -> None:
     """A waiting process is placed by its new needs, at its place in the queue."""
     cluster = Cluster("a")

@@ -378,6 +378,7 @@ def test_an_amendment_of_an_unknown_instance_is_refused(running) -> None:
     """The order is refused also if only a killed supervisor could have known the instance."""
     (settled,) = running.step(AmendmentOrdered(InstanceId("q", 1), NEVER))
     assert "q#1 is not known here" in settled.refusal
+    assert settled.code == "unknown"
     running.step(AmendmentOrdered(ONE, NEVER))
     settled = running.step(replaced())[0]
     assert isinstance(settled, Settle)

@@ -24,7 +24,6 @@ from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.devices import Device
 from rosrm.model.orders import (
-    NOT_AMENDED,
     AmendInstance,
     DropReplica,
     MeasureLinks,
@@ -293,7 +292,7 @@ class Host(ABC, Generic[ProgramT]):
                 self._settled.clear()
                 self.tell(event_of(order), now)
                 (settled,) = self._settled
-                refusal, code = settled.refusal, NOT_AMENDED
+                refusal, code = settled.refusal, settled.code
             case _:
                 self.tell(event_of(order), now)
         return OrderAnswered(sent.order_id, not refusal, code if refusal else "", refusal)
