@@ -39,7 +39,7 @@ def _run(arguments: Sequence[str]) -> None:
     from rosrm.cli import early  # noqa: PLC0415 - see above
 
     try:
-        early.join(arguments, os.environ)
+        early.join(early.completed_words(os.environ) or arguments, os.environ)
         from rosrm.cli.commands import app, keep_only  # noqa: PLC0415 - see above
 
         keep_only(arguments)

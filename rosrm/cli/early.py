@@ -46,6 +46,14 @@ def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         _made.clear()
 
 
+def completed_words(environment: Mapping[str, str]) -> list[str]:
+    """Return the words of the command line that a shell completes; []: this is no completion."""
+    if "_ROSRM_COMPLETE" not in environment:
+        return []
+    line = environment.get("_TYPER_COMPLETE_ARGS") or environment.get("COMP_WORDS", "")
+    return line.split()[1:]
+
+
 def _is_wanted(arguments: Collection[str], environment: Mapping[str, str]) -> bool:
     first = next(iter(arguments), "")
     otherwise = any(argument.startswith(_OTHERWISE) for argument in arguments)

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from rosrm.cli import completion
 from rosrm.errors import ConfigError
 from rosrm.extensions.units import Quantity
 from rosrm.model.ros_settings import HIGHEST_DOMAIN
@@ -33,16 +34,32 @@ Domain = Annotated[
     ),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")]
-Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of a process.")]
-Names = Annotated[list[str], typer.Argument(metavar="NAME...", help="Names of processes.")]
+Name = Annotated[
+    str,
+    typer.Argument(metavar="NAME", help="Name of a process.", autocompletion=completion.processes),
+]
+Names = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="NAME...", help="Names of processes.", autocompletion=completion.processes
+    ),
+]
 Array = Annotated[
     str, typer.Option("--array", metavar="NAME", help="Only jobs of this array, e.g. render.")
 ]
 Application = Annotated[
     str,
-    typer.Option("--app", metavar="APP", help="Only processes of this application."),
+    typer.Option(
+        "--app",
+        metavar="APP",
+        help="Only processes of this application.",
+        autocompletion=completion.applications,
+    ),
 ]
-Host = Annotated[str, typer.Argument(metavar="HOST", help="Name of a host.")]
+Host = Annotated[
+    str,
+    typer.Argument(metavar="HOST", help="Name of a host.", autocompletion=completion.hosts),
+]
 
 
 def seconds_of(

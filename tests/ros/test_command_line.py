@@ -20,7 +20,7 @@ import pytest
 
 from rosrm.testing.local_cluster import claim_domain
 from tests.ros.clusters import alive, host, wait_until_none
-from tests.waiting import PATIENCE, quickest, wait_gone
+from tests.waiting import PATIENCE, quickest, wait_gone, wait_until
 
 WORK = """
 processes:
@@ -158,6 +158,22 @@ def test_a_command_leaves_no_file_in_the_log_directory_of_ros(rosrm, tmp_path) -
     finally:
         del rosrm.environment["ROS_LOG_DIR"]
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("words", "name"), [("explain t", "talker"), ("drain h", "h1")])
+def test_names_complete_in_bash(rosrm, words, name) -> None:
+    """The names come from the master; on a busy machine a search may find none in time."""
+    line = {"_ROSRM_COMPLETE": "complete_bash", "COMP_WORDS": f"rosrm {words}", "COMP_CWORD": "2"}
+
+    def complete() -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "rosrm.cli"], env={**rosrm.environment, **line},
+            capture_output=True, text=True, timeout=PATIENCE, check=True,
+        )  # fmt: skip
+        assert done.stderr == ""
+        return done.stdout
+
+    wait_until(lambda: name in complete().split(), f"{name} as the completion of {words!r}")
 
 
 def test_hosts(rosrm) -> None:

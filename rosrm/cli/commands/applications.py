@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rosrm.cli import connection
+from rosrm.cli import completion, connection
 from rosrm.cli.commands.change import Timeout
 from rosrm.cli.options import AsJson, Domain
 from rosrm.cli.output.plain import echo
@@ -22,7 +22,12 @@ if TYPE_CHECKING:
     from rosrm.client.client import Client
     from rosrm.model.applications import ApplyResult
 
-Application = Annotated[str, typer.Argument(metavar="APP", help="Name of an application.")]
+Application = Annotated[
+    str,
+    typer.Argument(
+        metavar="APP", help="Name of an application.", autocompletion=completion.applications
+    ),
+]
 Plan = Annotated[
     bool,
     typer.Option(

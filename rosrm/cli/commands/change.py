@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rosrm.cli import connection
+from rosrm.cli import completion, connection
 from rosrm.cli.options import Application, Array, Domain, Host, Name, Names
 from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError
@@ -71,7 +71,11 @@ def cancel(
     ctx: typer.Context,
     words: Annotated[
         list[str] | None,
-        typer.Argument(metavar="NAME|WORK...", help="Processes, or work files that name them."),
+        typer.Argument(
+            metavar="NAME|WORK...",
+            help="Processes, or work files that name them.",
+            autocompletion=completion.processes,
+        ),
     ] = None,
     everything: Annotated[
         bool, typer.Option("--all", help="All processes that have not ended.")
@@ -166,7 +170,12 @@ def migrate(
     name: Name,
     to: Annotated[
         str | None,
-        typer.Option("--to", metavar="HOST", help="Destination; default: the master chooses."),
+        typer.Option(
+            "--to",
+            metavar="HOST",
+            help="Destination; default: the master chooses.",
+            autocompletion=completion.hosts,
+        ),
     ] = None,
     wait: Wait = False,
     timeout: Timeout = "",
@@ -261,11 +270,19 @@ def drain(
 def prune(
     ctx: typer.Context,
     names: Annotated[
-        list[str] | None, typer.Argument(metavar="NAME...", help="Names of ended processes.")
+        list[str] | None,
+        typer.Argument(
+            metavar="NAME...", help="Names of ended processes.", autocompletion=completion.processes
+        ),
     ] = None,
     hosts: Annotated[
         list[str] | None,
-        typer.Option("--host", metavar="HOST", help="A host that left or is lost; repeatable."),
+        typer.Option(
+            "--host",
+            metavar="HOST",
+            help="A host that left or is lost; repeatable.",
+            autocompletion=completion.hosts,
+        ),
     ] = None,
     domain: Domain = None,
 ) -> None:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from rosrm.cli import connection
+from rosrm.cli import completion, connection
 from rosrm.cli.options import AsJson, Domain, Names, seconds_of
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
@@ -26,10 +26,22 @@ def events(  # noqa: PLR0917 - an argument for each option
         bool, typer.Option("--follow", "-f", help="Print new events until Ctrl-C.")
     ] = False,
     process: Annotated[
-        str, typer.Option("--process", metavar="NAME", help="Show only events of this process.")
+        str,
+        typer.Option(
+            "--process",
+            metavar="NAME",
+            help="Show only events of this process.",
+            autocompletion=completion.processes,
+        ),
     ] = "",
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="Show only events of this host.")
+        str,
+        typer.Option(
+            "--host",
+            metavar="HOST",
+            help="Show only events of this host.",
+            autocompletion=completion.hosts,
+        ),
     ] = "",
     newest: Annotated[
         int, typer.Option("--newest", "-n", metavar="N", min=1, help="Show the newest N events.")
@@ -109,7 +121,13 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
         ),
     ] = False,
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="Print only output from this host.")
+        str,
+        typer.Option(
+            "--host",
+            metavar="HOST",
+            help="Print only output from this host.",
+            autocompletion=completion.hosts,
+        ),
     ] = "",
     raw: Annotated[
         bool,

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from rosrm.cli import connection
+from rosrm.cli import completion, connection
 from rosrm.cli.options import Application, Array, AsJson, Domain, Name
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
@@ -36,7 +36,13 @@ def ps(  # noqa: PLR0917 - an argument for each option
         bool, typer.Option("--all", "-a", help="List finished and cancelled processes too.")
     ] = False,
     host: Annotated[
-        str, typer.Option("--host", metavar="HOST", help="List only processes on this host.")
+        str,
+        typer.Option(
+            "--host",
+            metavar="HOST",
+            help="List only processes on this host.",
+            autocompletion=completion.hosts,
+        ),
     ] = "",
     array: Array = "",
     application: Application = "",
