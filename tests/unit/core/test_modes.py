@@ -13,7 +13,7 @@ from rosrm.core.master.modes.switching import mode_rows
 from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.modes import Mode, Trigger
-from rosrm.model.values import HostLossPolicy, ProcessSpec
+from rosrm.model.values import HostLossPolicy, ProcessSpec, StartOrder
 from tests.unit.core.cluster import Cluster, Eq1, Machine, movable, process
 from tests.unit.core.test_applications import actions, new
 
@@ -73,6 +73,21 @@ def test_a_switch_does_not_touch_what_both_modes_share() -> None:
     assert [cluster[name].owner for name in ("planner", "driver")] == kept
     assert states(cluster) == {"exploring": "", "docked": "in force"}
     assert cluster.recorded("mode_reached")[-1] == "the mode docked is in force"
+
+
+def test_a_switch_stops_a_process_of_another_application_after_its_dependants() -> None:
+    """The order of the applications does not matter."""
+    sensors = target("sensors", process("camera"))
+    nav = target("nav", process("planner", start_order=StartOrder({"camera": "ready"})))
+    cluster = Cluster(Machine("a", stubborn={"planner"}))
+    in_mode(
+        "exploring", Mode("exploring", (sensors, nav)), Mode("docked", (DOCK,)), cluster=cluster
+    )
+    switch(cluster, "docked", 2.0)
+    assert cluster["camera"].reason == "being cancelled; waits until planner has ended"
+    cluster.let_go("planner")
+    cluster.wait(2.0)
+    assert (cluster.phase("camera"), states(cluster)["docked"]) == ("cancelled", "in force")
 
 
 def test_a_mode_changes_the_parameters_of_an_application() -> None:

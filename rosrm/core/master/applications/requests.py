@@ -11,8 +11,10 @@ from rosrm.core.master.applications import rollout
 from rosrm.core.master.applications.difference import Difference, differences
 from rosrm.core.master.applications.planning import Outlook, plan
 from rosrm.core.master.assignment.gangs import check_gangs
+from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
+from rosrm.core.master.dependants import dependants_first
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
@@ -41,6 +43,11 @@ class Prepared:
     application: Application
     version: Version | None
     found: Mapping[str, Difference]
+
+    @property
+    def number(self) -> int:
+        """Return the number of the desired version; 0: the application is cancelled."""
+        return 0 if self.version is None else self.version.number
 
 
 def applications_requested(
@@ -76,9 +83,11 @@ def outlook(state: MasterState, targets: Sequence[Target], by: Requester, now: f
     return replace(planned, message="; ".join((_summary(prepared), *planned.returns)))
 
 
-def _want_all(state: MasterState, prepared: Iterable[Prepared], by: Requester, now: float) -> None:
-    for one in prepared:
-        _want(state, one, by, now)
+def _want_all(state: MasterState, prepared: Sequence[Prepared], by: Requester, now: float) -> None:
+    changed = [one for one in prepared if _note_change(state, one, by, now)]
+    _cancel_undesired(state, changed, now)
+    for one in changed:
+        rollout.want(state, state.applications[one.application.name], one.number, now)
 
 
 # --- checks -----------------------------------------------------------------------------------
@@ -245,16 +254,16 @@ def _start_order_fault(state: MasterState, prepared: Iterable[Prepared]) -> str:
 # --- changes ----------------------------------------------------------------------------------
 
 
-def _want(state: MasterState, one: Prepared, by: Requester, now: float) -> None:
-    """Make a version the desired one, unless all processes are as it wants them already."""
+def _note_change(state: MasterState, one: Prepared, by: Requester, now: float) -> bool:
+    """Keep and record a version; return False if all processes are as it wants them already."""
     application, version = state.applications.get(one.application.name), one.version
     if application is None:
         application = state.applications[one.application.name] = Application(
             one.application.name, by.name
         )
-    number = 0 if version is None else version.number
+    number = one.number
     if number == application.wanted and not one.found and not application.paused:
-        return  # what is not done yet goes on
+        return False  # what is not done yet goes on
     if version is not None and version.number > application.newest:
         application.newest = version.number
         state.save_version(application, version)
@@ -263,7 +272,18 @@ def _want(state: MasterState, one: Prepared, by: Requester, now: float) -> None:
         now, EventKind.APPLICATION_REQUESTED, f"{what} of {application.name} was requested", by=by,
         facts={"application": application.name, "version": number},
     )  # fmt: skip
-    rollout.want(state, application, number, now)
+    return True
+
+
+def _cancel_undesired(state: MasterState, changed: Iterable[Prepared], now: float) -> None:
+    """Cancel what no version has any more; dependants first, also of other applications."""
+    ending = [
+        state.processes[name] for one in changed for name, difference in one.found.items()
+        if difference.action is Action.STOP
+    ]  # fmt: skip
+    for process in dependants_first(state, ending):
+        if process.wanted is not DesiredState.CANCEL:
+            cancel(state, process, now, by=Requester(process.principal))
 
 
 def _actions(prepared: Iterable[Prepared]) -> Iterable[PlannedAction]:
