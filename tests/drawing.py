@@ -13,6 +13,7 @@ from rosrm.model.arrays import NO_ARRAY
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
+from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
 from rosrm.model.schedules import NO_SCHEDULE, WEEKDAYS, Schedule
 from rosrm.model.values import (
@@ -20,6 +21,7 @@ from rosrm.model.values import (
     DependencyRestartAction,
     Enforcement,
     Kind,
+    LifecyclePolicy,
     Limits,
     NeighbourRule,
     ProcessSpec,
@@ -190,11 +192,16 @@ def _for_jobs(spec: ProcessSpec) -> dict[str, Any]:
     return {} if is_job else {"array": NO_ARRAY, "schedule": NO_SCHEDULE}
 
 
+def _accepted(spec: ProcessSpec, program: dict[str, Any]) -> ProcessSpec:
+    """Return a spec with one program, and without contradictions."""
+    fields_ = {**_NO_PROGRAM, **program, **_scheduling(spec), **_for_jobs(spec)}
+    spec = replace(spec, **fields_)
+    return replace(spec, lifecycle=LifecyclePolicy()) if lifecycle_fault(spec) else spec
+
+
 #: Specs with one program, as a master accepts them.
 SPECS: Final = st.builds(
-    lambda spec, program: replace(
-        spec, **{**_NO_PROGRAM, **program, **_scheduling(spec), **_for_jobs(spec)}
-    ),
+    _accepted,
     drawn(
         ProcessSpec,
         application=st.one_of(st.just(""), PROPER_NAMES),

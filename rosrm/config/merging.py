@@ -106,6 +106,7 @@ _LONG_FORMS: Final[Mapping[str, Callable[[Node], Node]]] = {
     "restart": _word("when"),
     "migration": _word("strategy"),
     "readiness": _word("kind"),
+    "lifecycle": _word("autostart"),
     "host_loss": _word("then"),
     "isolation": _word("then"),
     "standby": _word("wanted"),

@@ -28,6 +28,7 @@ from rosrm.model.parameters import flattened
 from rosrm.model.schedules import SHORTEST, Schedule
 from rosrm.model.values import (
     EMPTY,
+    Autostart,
     Container,
     Enforcement,
     GroupMembership,
@@ -37,6 +38,7 @@ from rosrm.model.values import (
     IsolationAction,
     IsolationPolicy,
     Kind,
+    LifecyclePolicy,
     Limits,
     MigrationPolicy,
     NeighbourRule,
@@ -55,6 +57,7 @@ from rosrm.model.values import (
 
 _RESTART: Final = RestartPolicy()
 _READINESS: Final = Readiness()
+_LIFECYCLE: Final = LifecyclePolicy()
 _STOP: Final = StopPolicy()
 
 Text = Annotated[str, PlainWord()]
@@ -145,6 +148,14 @@ class HealthInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class LifecycleInFile:
+    """State to which a host brings a lifecycle node."""
+
+    autostart: Autostart = "active"
+    timeout: PositiveSeconds = _LIFECYCLE.timeout
+
+
+@dataclass(frozen=True, slots=True)
 class LabelsInFile:
     """Host labels that a process requires, prefers or avoids."""
 
@@ -230,6 +241,7 @@ class ProcessInFile:
         "isolation": ("stop", "{then: stop, after: 10s}"),
         "standby": ("true", "{apart_by: [rack]}"),
         "health": ("{topic: scan, rate: 10}", "{lifecycle: active}"),
+        "lifecycle": ("active", "{autostart: inactive, timeout: 10s}"),
         "near": ("camera", "{processes: [camera], by: rack}"),
         "apart": ("camera", "{processes: [camera], by: rack}"),
         "spread": ("rack", "{}"),
@@ -276,6 +288,7 @@ class ProcessInFile:
     isolation: IsolationInFile = field(default_factory=IsolationInFile)
     standby: StandbyInFile = field(default_factory=lambda: StandbyInFile(wanted=False))
     health: HealthInFile | None = None
+    lifecycle: LifecycleInFile | None = None
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
@@ -329,6 +342,9 @@ class ProcessInFile:
             isolation=_same(IsolationPolicy, self.isolation),
             standby=_same(StandbyPolicy, self.standby),
             health=Health() if self.health is None else _same(Health, self.health),
+            lifecycle=_LIFECYCLE
+            if self.lifecycle is None
+            else _same(LifecyclePolicy, self.lifecycle),
             neighbours=tuple(self._neighbour_rules()),
             reschedule=_same(ReschedulePolicy, self.reschedule),
             limits=_same(Limits, self.limits),

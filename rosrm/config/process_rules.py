@@ -21,6 +21,7 @@ from rosrm.model.description_checks import (
 )
 from rosrm.model.devices import need_fault
 from rosrm.model.job_checks import job_fault
+from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.placeholders import ARTIFACTS, DEVICE, WITH_PLACEHOLDERS, placeholder_faults
 from rosrm.model.secret_rules import is_variable, secret_faults
@@ -201,6 +202,12 @@ def _about_health(spec: ProcessSpec) -> Iterator[Complaint]:
         yield Complaint(("health",), text)
 
 
+def _about_lifecycle(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = lifecycle_fault(spec)
+    if fault:
+        yield Complaint(("lifecycle",), fault)
+
+
 def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
     programs = {
         "package + executable": spec.package or spec.executable,
@@ -310,6 +317,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_jobs, ("array", "parallel", "every", "at", "on", "kind")),
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", "node_name", *_PROGRAM)),
+    (_about_lifecycle, ("lifecycle", "ros", "node_name", "readiness", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_start_order, ("name", "after")),
     (_about_devices, ("devices",)),

@@ -50,6 +50,8 @@ DependencyRestartAction = Literal["ignore", "restart"]
 GroupEnd = Literal["never", "on-failure", "always"]
 #: "": the default scheduling of the operating system.
 RealtimePolicy = Literal["", "fifo", "rr"]
+#: State to which a slave brings a lifecycle node; "unmanaged": it does not.
+Autostart = Literal["active", "inactive", "unmanaged"]
 
 
 class Kind(str, Enum):
@@ -288,6 +290,30 @@ class Health:
 
 
 @dataclass(frozen=True, slots=True)
+class LifecyclePolicy:
+    """Transitions of a lifecycle node by its slave, after each start and each restart.
+
+    Attributes:
+        autostart: state to which the slave brings the node; "unmanaged": it does not.
+        timeout: seconds for each transition.
+    """
+
+    autostart: Autostart = "unmanaged"
+    timeout: float = 30.0
+
+    @property
+    def is_managed(self) -> bool:
+        """Return True if the slave brings the node to a state."""
+        return self.autostart != "unmanaged"
+
+    @property
+    def total_timeout(self) -> float:
+        """Return the seconds for all transitions after a start."""
+        transitions = {"unmanaged": 0, "inactive": 1, "active": 2}[self.autostart]
+        return transitions * self.timeout
+
+
+@dataclass(frozen=True, slots=True)
 class GroupMembership:
     """Membership of a process in a group, whose processes end together.
 
@@ -400,6 +426,7 @@ class ProcessSpec:
     isolation: IsolationPolicy = IsolationPolicy()
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
+    lifecycle: LifecyclePolicy = LifecyclePolicy()
     neighbours: tuple[NeighbourRule, ...] = ()
     talks_to: Mapping[str, float] = field(default_factory=lambda: EMPTY)
     reschedule: ReschedulePolicy = ReschedulePolicy()
@@ -445,6 +472,11 @@ class ProcessSpec:
         """True if an instance is ready when its node appears, False as soon as it runs."""
         kind = self.readiness.kind
         return kind == "graph" or (kind == "auto" and bool(self.ros))
+
+    @property
+    def ready_timeout(self) -> float:
+        """Return the seconds after which a run that is not ready has failed."""
+        return self.readiness.timeout + self.lifecycle.total_timeout
 
     @property
     def fetch_time(self) -> float:

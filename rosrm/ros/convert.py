@@ -35,6 +35,7 @@ from rosrm.model.devices import (
 )
 from rosrm.model.durations import LONGEST
 from rosrm.model.job_checks import job_fault
+from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.modes import Mode, Trigger
 from rosrm.model.parameters import pattern_fault
@@ -209,7 +210,8 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         talks_to={flow.process: flow.rate for flow in message.talks_to},
         artifacts=_artifacts(message),
     )  # fmt: skip
-    fault = limits_fault(spec) or job_fault(spec) or secrets_fault(spec) or container_fault(spec)
+    checks = (limits_fault, job_fault, secrets_fault, container_fault, lifecycle_fault)
+    fault = next(filter(None, (check(spec) for check in checks)), "")
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec
@@ -445,6 +447,7 @@ def _word_fault(message: msg.ProcessSpec) -> str:
             get_args(values.DependencyRestartAction),
         ),
         ("group.ends", message.group.ends, get_args(values.GroupEnd)),
+        ("lifecycle", message.lifecycle.autostart, get_args(values.Autostart)),
     )
     for name, given, allowed in words:
         if given not in allowed:
@@ -464,6 +467,7 @@ def _times_fault(message: msg.ProcessSpec) -> str:
         "host_loss.delay": message.host_loss.delay,
         "isolation.after": message.isolation.after,
         "health.timeout": message.health.timeout,
+        "lifecycle.timeout": message.lifecycle.timeout,
         "reschedule.delay": message.reschedule.delay,
         "time_limit": message.time_limit,
         "after.delay": message.start_order.delay,

@@ -13,9 +13,9 @@ def to_memo(memo: Memo) -> str:
     """Return a memo as text, its parts as lists of their fields; "" if it is empty."""
     if memo == Memo():
         return ""
-    awaited, watch, devices, artifacts = astuple(memo)
+    awaited, watch, devices, artifacts, lifecycle = astuple(memo)
     plain = {"awaited": awaited, "watch": watch}
-    given = {"devices": devices, "artifacts": artifacts}
+    given = {"devices": devices, "artifacts": artifacts, "lifecycle": lifecycle}
     return json.dumps({**plain, **{name: value for name, value in given.items() if value}})
 
 

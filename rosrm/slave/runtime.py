@@ -47,6 +47,7 @@ from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.flows import FlowSampler
 from rosrm.ros.slave.graph import GraphWatch
 from rosrm.ros.slave.journal_watermark import JournalWatermark
+from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import handle_signals
@@ -151,6 +152,7 @@ class SlaveRuntime:
             self._open_supervisor(opened)
             graph = self._join_ros(opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
+            self._lifecycle_clients = LifecycleClients(self._participant, self._take)
             self._note_probes(first)
             self._note_broken(offered.broken)
             name = f"{self._participant.node.get_name()}_flows"
@@ -338,6 +340,7 @@ class SlaveRuntime:
                 self._cycle(now)
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
+                self._lifecycle_clients.expire(now)
                 guard.call(self._usage.look, now, self._sampler.by_process)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
@@ -506,6 +509,8 @@ class SlaveRuntime:
         elif isinstance(command, commands.Settle):
             for settled in self._unsettled.pop((command.instance, command.amendment), []):
                 settled(command.refusal, command.code)
+        elif isinstance(command, commands.ReadLifecycleState | commands.ChangeLifecycleState):
+            self._participant.guard.call(self._lifecycle_clients.send, command, time.monotonic())
         else:
             self._have_supervisor(command)
 
@@ -523,6 +528,7 @@ class SlaveRuntime:
         self._usage.follow(status)
         if status.state.ended:
             self._starter.ended(status.instance)
+            self._lifecycle_clients.close(status.instance)
 
     # --- requests of the master, and of readers of logs ----------------------------------
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.core.slave.watches import Awaited, Memo, Watch
+from rosrm.core.slave.watches import Awaited, ManagedLifecycle, Memo, Watch
 from rosrm.model.plan import ReportPhase
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
@@ -45,6 +45,10 @@ MEMOS = [
         ),
     ),
     (Memo(Awaited("/talker", 1.5)), '{"awaited": ["/talker", 1.5, 0], "watch": null}'),
+    (
+        Memo(lifecycle=ManagedLifecycle("active", "/n/get", "/n/set", 30.0)),
+        '{"awaited": null, "watch": null, "lifecycle": ["active", "/n/get", "/n/set", 30.0]}',
+    ),
     (
         Memo(watch=Watch(Health())),
         '{"awaited": null, "watch": [["", 0.0, "", 0.0], [], [], true, false]}',

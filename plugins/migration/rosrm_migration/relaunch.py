@@ -43,7 +43,7 @@ class Relaunch:
 def _start_first(move: Move, options: RelaunchOptions) -> Plan:
     started = move.destination_spec
     settle = options.settle if started.ros else 0.0
-    ready, stop = started.readiness.timeout + settle, move.spec.stop.timeout
+    ready, stop = started.ready_timeout + settle, move.spec.stop.timeout
     return Plan(
         (
             Start(
@@ -70,7 +70,7 @@ def _stop_first(move: Move, start_timeout: float) -> Plan:
                 undo=_stop_destination(move),
             ),
             AwaitReady(
-                move.destination, move.destination_host, move.destination_spec.readiness.timeout
+                move.destination, move.destination_host, move.destination_spec.ready_timeout
             ),
             Commit(),
         ),

@@ -187,6 +187,9 @@ def _awaited_node(process: Process, owner: Instance | None) -> str:
         return ""
     name = owner.node_name or spec.node
     node = f"its node {qualified_name(spec.namespace, name)}" if name else "a node of it"
+    if spec.lifecycle.is_managed:
+        goal, limit = spec.lifecycle.autostart, spec.ready_timeout
+        return f"waits until {node} is {goal}, for at most {limit:g} s"
     return f"waits for {node} in the ROS graph, for at most {spec.readiness.timeout:g} s"
 
 

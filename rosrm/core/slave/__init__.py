@@ -6,5 +6,6 @@ orders.py        orders of the master as events
 handlers.py      one handler for each event
 state.py         the instances on this host
 watches.py       readiness and health checks; health.py evaluates the checks
+lifecycle_nodes.py  transitions of lifecycle nodes
 fencing.py, master_clock.py
 """

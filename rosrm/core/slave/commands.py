@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from rosrm.core.slave.watches import Memo
+from rosrm.core.slave.watches import ManagedLifecycle, Memo, Transition
 from rosrm.model.orders import NOT_AMENDED
 from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
 
@@ -91,6 +91,36 @@ class Settle:
 
 
 @dataclass(frozen=True, slots=True)
+class ReadLifecycleState:
+    """Request the lifecycle state of a node; `LifecycleStateRead` follows if it answers.
+
+    Attributes:
+        pid: pid of the run.
+        at: time of the request.
+    """
+
+    instance: InstanceId
+    pid: int
+    lifecycle: ManagedLifecycle
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class ChangeLifecycleState:
+    """Request a lifecycle transition of a node; `TransitionAnswered` follows if it answers.
+
+    Attributes:
+        pid: pid of the run.
+        transition: "configure", "activate" or "deactivate".
+    """
+
+    instance: InstanceId
+    pid: int
+    lifecycle: ManagedLifecycle
+    transition: Transition
+
+
+@dataclass(frozen=True, slots=True)
 class Remember:
     """Order the supervisor to store facts for a later run of this slave."""
 
@@ -114,5 +144,6 @@ class Report:
 
 
 Command = (
-    Launch | Stop | Fence | Renew | Restart | Fail | Amend | Settle | Remember | Forget | Report
-)
+    Launch | Stop | Fence | Renew | Restart | Fail | Amend | Settle | ReadLifecycleState
+    | ChangeLifecycleState | Remember | Forget | Report
+)  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rosrm.core.slave.watches import Memo, Observation
+from rosrm.core.slave.watches import Memo, Observation, Transition
 from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
 
 
@@ -142,6 +142,35 @@ class SeenInGraph:
 
 
 @dataclass(frozen=True, slots=True)
+class LifecycleStateRead:
+    """A node reported its lifecycle state.
+
+    Attributes:
+        pid: pid of the run that was asked.
+        asked_at: time of the request.
+    """
+
+    instance: InstanceId
+    pid: int
+    state: str
+    asked_at: float
+
+
+@dataclass(frozen=True, slots=True)
+class TransitionAnswered:
+    """A node answered a request for a lifecycle transition.
+
+    Attributes:
+        pid: pid of the run that was asked.
+    """
+
+    instance: InstanceId
+    pid: int
+    transition: Transition
+    succeeded: bool
+
+
+@dataclass(frozen=True, slots=True)
 class LookedAt:
     """A watched instance was observed.
 
@@ -186,6 +215,8 @@ Event = (
     | SupervisorReported
     | SupervisorReplaced
     | SeenInGraph
+    | LifecycleStateRead
+    | TransitionAnswered
     | LookedAt
     | DevicesMissed
     | TimePassed

@@ -7,7 +7,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
-from rosrm.core.slave import commands, events, fencing
+from rosrm.core.slave import commands, events, fencing, lifecycle_nodes
 from rosrm.core.slave.health import InstanceHealth, watch_of
 from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.core.slave.watches import Awaited, Memo
@@ -99,7 +99,7 @@ def _waiting(assignment: Assignment) -> HeldInstance:
     watch, fenced = watch_of(assignment), assignment.fence is not None
     return HeldInstance(
         status, spec, awaited, watch=watch, fenced=fenced, devices=assignment.devices,
-        artifacts=spec.artifacts,
+        artifacts=spec.artifacts, lifecycle=lifecycle_nodes.managed(assignment),
     )  # fmt: skip
 
 
@@ -303,19 +303,20 @@ def _follow(
         known = memo or Memo()
         held = state.held[reported.instance] = HeldInstance(
             reported, awaited=known.awaited, watch=known.watch, devices=known.devices,
-            artifacts=known.artifacts,
+            artifacts=known.artifacts, lifecycle=known.lifecycle,
         )  # fmt: skip
         if reported.state is InstanceState.RUNNING:
             held.status = _running(held, reported, now)
     elif reported.state is InstanceState.RUNNING:
-        if held.status.state is InstanceState.READY and held.status.pid == reported.pid:
+        arrived = held.status.state is InstanceState.READY or held.steering is not None
+        if arrived and held.status.pid == reported.pid:
             if held.status.enforced == reported.enforced:
                 return None
             held.status = replace(held.status, enforced=reported.enforced)
         else:
             held.status = _running(held, reported, now)
     else:
-        held.ready_by = None
+        held.ready_by = held.steering = None
         held.status = _with_unready(held, reported)
     if held.status.state.ended:
         held.ended_at = now
@@ -325,6 +326,7 @@ def _follow(
 
 def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:
     """Return the status of a new run: ready at once, or after its node appears in the graph."""
+    held.steering = None
     if held.awaited is None or held.awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
     held.ready_by = now + held.awaited.timeout
@@ -342,12 +344,52 @@ def _seen(state: SlaveState, event: events.SeenInGraph, now: float) -> _Commands
     if held is None or held.ready_by is None or held.awaited is None:
         return []
     held.ready_by = None
+    if held.lifecycle is not None:
+        return list(lifecycle_nodes.begin(held, held.lifecycle, now).commands)
+    return _ready(state, held, held.awaited, now)
+
+
+def _ready(state: SlaveState, held: HeldInstance, awaited: Awaited, now: float) -> _Commands:
     held.status = replace(held.status, state=InstanceState.READY)
-    held.awaited = replace(held.awaited, seen=held.status.pid)
+    held.awaited = replace(awaited, seen=held.status.pid)
     return [
-        *_start_waiting(state, now), commands.Remember(event.instance, held.memo),
+        *_start_waiting(state, now), commands.Remember(held.status.instance, held.memo),
         commands.Report((held.status,)),
     ]  # fmt: skip
+
+
+def _state_read(state: SlaveState, event: events.LifecycleStateRead, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.status.pid != event.pid:
+        return []
+    return _after(state, held, lifecycle_nodes.state_read(held, event, now), now)
+
+
+def _transition_answered(
+    state: SlaveState, event: events.TransitionAnswered, now: float
+) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.status.pid != event.pid:
+        return []
+    return _after(state, held, lifecycle_nodes.transition_answered(held, event, now), now)
+
+
+def _after(
+    state: SlaveState, held: HeldInstance, step: lifecycle_nodes.Step, now: float
+) -> _Commands:
+    """Return the commands that follow from a step of a lifecycle node to its goal."""
+    if step.commands:
+        return list(step.commands)
+    status = held.status
+    if step.fault:
+        held.steering = None
+        return [commands.Fail(status.instance, status.pid, step.fault, kill=False)]
+    if not step.reached:
+        return []
+    held.steering = None
+    if status.state is InstanceState.READY or held.awaited is None:
+        return []
+    return _ready(state, held, held.awaited, now)
 
 
 def _looked_at(state: SlaveState, event: events.LookedAt, now: float) -> _Commands:
@@ -396,6 +438,8 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
                 f"ROS graph"
             )
             orders.append(commands.Stop(instance))
+        elif held.steering is not None:
+            orders += _after(state, held, lifecycle_nodes.time_passed(held, now), now)
         elif held.status.state.ended and _may_be_discarded(state, held, now):
             forgotten.append(instance)
     if forgotten:
@@ -426,6 +470,8 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.SupervisorReported: _supervisor_reported,
         events.SupervisorReplaced: _supervisor_replaced,
         events.SeenInGraph: _seen,
+        events.LifecycleStateRead: _state_read,
+        events.TransitionAnswered: _transition_answered,
         events.LookedAt: _looked_at,
         events.DevicesMissed: _devices_missed,
         events.TimePassed: _time_passed,

@@ -21,10 +21,14 @@ ReportRequested         reports all instances
 SupervisorReported      updates the statuses; a new run must become ready again
 SupervisorReplaced      the same; drops the instances that the new supervisor does not know,
                         reports all instances, and repeats orders that may be lost
-SeenInGraph             marks the instance as ready, also for a later run of this slave
+SeenInGraph             marks the instance as ready, also for a later run of this slave; or reads
+                        the state of a lifecycle node that the slave brings to a goal
+LifecycleStateRead      requests the next transition; at the goal, marks the instance as ready
+TransitionAnswered      the same; ends the instance as failed if the transition failed
 LookedAt                ends an instance as failed if it has been unhealthy for too long
 DevicesMissed           ends each running instance as failed that holds a missing device
-TimePassed              stops an instance that is not ready in time, refuses an instance whose fence
+TimePassed              stops an instance that is not ready in time, ends one as failed whose
+                        lifecycle transition takes too long, refuses an instance whose fence
                         expired before its start, and drops old ends
 ======================  =========================================================================
 """

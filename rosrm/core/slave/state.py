@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.slave.health import InstanceHealth
-from rosrm.core.slave.watches import Awaited, Memo, Watch
+from rosrm.core.slave.watches import Awaited, ManagedLifecycle, Memo, Transition, Watch
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import (
@@ -25,6 +25,25 @@ from rosrm.model.values import (
 )
 
 _SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
+
+
+@dataclass(slots=True)
+class Steering:
+    """Way of a lifecycle node to its goal.
+
+    Attributes:
+        began: time at which the node got its goal, or appeared in the graph.
+        deadline: time by which the state must be known, or the transition must be complete.
+        read_at: time of the newest request for the state.
+        state: newest known state; "": unknown.
+        transition: transition under way; None: none.
+    """
+
+    began: float
+    deadline: float
+    read_at: float
+    state: str = ""
+    transition: Transition | None = None
 
 
 @dataclass(slots=True)
@@ -45,6 +64,8 @@ class HeldInstance:
         ended_at: time of its end, or of the report of the end to a newly registered master.
         devices: devices that it holds.
         artifacts: artifacts that it uses.
+        lifecycle: None: the slave does not change the lifecycle state of its node.
+        steering: None: its node is not in the graph, or has reached its goal.
     """
 
     status: InstanceStatus
@@ -59,11 +80,19 @@ class HeldInstance:
     ended_at: float = 0.0
     devices: tuple[HeldDevice, ...] = ()
     artifacts: tuple[Artifact, ...] = ()
+    lifecycle: ManagedLifecycle | None = None
+    steering: Steering | None = None
 
     @property
     def memo(self) -> Memo:
         """Return the facts that a later run of this slave needs."""
-        return Memo(self.awaited, self.watch, self.devices, self.artifacts)
+        return Memo(self.awaited, self.watch, self.devices, self.artifacts, self.lifecycle)
+
+    @property
+    def becomes_ready(self) -> bool:
+        """Return True if it runs and is not ready yet."""
+        ready = self.status.state is InstanceState.READY
+        return self.ready_by is not None or (self.steering is not None and not ready)
 
     @property
     def watched(self) -> Watch | None:
@@ -155,7 +184,7 @@ class SlaveState:
     def starting(self) -> int:
         """Return the number of instances being started, or running and not ready yet."""
         return sum(
-            held.status.state is InstanceState.STARTING or held.ready_by is not None
+            held.status.state is InstanceState.STARTING or held.becomes_ready
             for held in self.held.values()
         )
 

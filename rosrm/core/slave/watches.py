@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import Literal
 
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import Health
+
+#: Lifecycle transitions that a slave requests.
+Transition = Literal["configure", "activate", "deactivate"]
 
 
 class NoState(Enum):
@@ -69,6 +73,23 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True)
+class ManagedLifecycle:
+    """State to which the slave brings a lifecycle node after each start and each restart.
+
+    Attributes:
+        goal: "active" or "inactive".
+        get_state: absolute name of the service that returns the state.
+        change_state: absolute name of the service that changes the state.
+        timeout: seconds for each transition.
+    """
+
+    goal: str
+    get_state: str
+    change_state: str
+    timeout: float
+
+
+@dataclass(frozen=True, slots=True)
 class Memo:
     """Facts about an instance for a later run of this slave, which does not know its spec.
 
@@ -77,9 +98,11 @@ class Memo:
         watch: None: the instance has no health checks.
         devices: devices that the instance holds.
         artifacts: artifacts that the instance uses.
+        lifecycle: None: the slave does not change the lifecycle state of the node.
     """
 
     awaited: Awaited | None = None
     watch: Watch | None = None
     devices: tuple[HeldDevice, ...] = ()
     artifacts: tuple[Artifact, ...] = ()
+    lifecycle: ManagedLifecycle | None = None

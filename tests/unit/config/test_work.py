@@ -14,6 +14,7 @@ from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
     Container,
     Kind,
+    LifecyclePolicy,
     Limits,
     MigrationPolicy,
     NeighbourRule,
@@ -102,6 +103,13 @@ def test_every_key_is_read(file):
         ("command: x, migration: relaunch", "migration", MigrationPolicy("relaunch")),
         ("command: x, migration: null", "migration", MigrationPolicy()),
         ("command: x, readiness: running", "readiness", Readiness("running")),
+        ("package: p, executable: e, lifecycle: active", "lifecycle", LifecyclePolicy("active")),
+        (
+            "package: p, executable: e, lifecycle: {timeout: 5s}",
+            "lifecycle",
+            LifecyclePolicy("active", 5.0),
+        ),
+        ("package: p, executable: e", "lifecycle", LifecyclePolicy("unmanaged")),
         ("package: p, executable: e", "ros", True),
         ("package: p, executable: e, ros: false", "ros", False),
         ("command: x, near: b", "neighbours", (NeighbourRule("near", ("b",)),)),
@@ -248,7 +256,7 @@ def test_faults_of_neighbours_flows_and_secrets_are_named(file, entry, text):
 BESIDE = {
     "spread": "foreach: {i: [1, 2]}", "at": "kind: job", "on": "kind: job, at: '06:00'",
     "standby": "migration: handoff", "health": "ros: true", "parameters": "ros: true",
-    "remappings": "ros: true",
+    "remappings": "ros: true", "lifecycle": "ros: true",
 }  # fmt: skip
 
 
@@ -472,6 +480,16 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
             "name: a, module: x, ros: true, node_name: keep, health: {lifecycle: active}",
             "`node_name: keep` leaves it unknown",
         ),
+        (
+            "name: a, module: x, ros: true, node_name: keep, lifecycle: active",
+            "lifecycle: the name of the node is required",
+        ),
+        ("name: a, command: x, lifecycle: active", "lifecycle: only a ROS node has a lifecycle"),
+        (
+            "name: a, module: x, ros: true, readiness: running, lifecycle: inactive",
+            "`readiness: running` does not wait for that",
+        ),
+        ("name: a, module: x, ros: true, lifecycle: on", "autostart"),
         ("name: a, command: 'x $(find-pkg-share b)'", "write a list of words"),
         ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
         ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is required"),

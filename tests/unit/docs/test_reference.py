@@ -112,7 +112,7 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
 def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
-    wanted |= {"host_loss", "isolation", "standby", "health", "spread", "reschedule"}
+    wanted |= {"host_loss", "isolation", "standby", "health", "lifecycle", "spread", "reschedule"}
     wanted |= {"limits", "realtime", "container", "after.delay", "after.on_restart"}
     wanted |= {"group", *keys(GroupInFile, "group.")}
     wanted |= {"app", "rollout", *keys(RolloutInFile, "rollout.")}

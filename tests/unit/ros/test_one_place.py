@@ -20,6 +20,7 @@ OTHER_TYPES = {
     "ros/polling.py": "the types of its callers",
     "ros/slave/flows.py": "topics of applications",
     "ros/slave/health.py": "topics and services of applications",
+    "ros/slave/lifecycle_nodes.py": "services of applications",
     "ros/slave/publisher_watch.py": "topics of applications",
 }
 

@@ -20,6 +20,7 @@ from rosrm.core.slave.events import (
     ContactConfirmed,
     FenceOrdered,
     LaunchRefused,
+    LifecycleStateRead,
     LookedAt,
     MasterLost,
     Registered,
@@ -31,6 +32,7 @@ from rosrm.core.slave.events import (
     SupervisorReplaced,
     SupervisorReported,
     TimePassed,
+    TransitionAnswered,
 )
 from rosrm.core.slave.handlers import REMEMBER_END
 from rosrm.core.slave.health import LOOK_PERIOD
@@ -43,6 +45,7 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    LifecyclePolicy,
     Limits,
     ProcessSpec,
     Readiness,
@@ -500,7 +503,11 @@ NUMBERS = st.integers(1, 4)
 WATCHED = ProcessSpec(
     "w", command=("true",), health=Health(timeout=0.5), restart=ON_FAILURE.restart
 )
-SPECS = st.sampled_from([PLAIN, NODE, WATCHED])
+MANAGED = replace(NODE, name="m", lifecycle=LifecyclePolicy("active", 10.0))
+SPECS = st.sampled_from([PLAIN, NODE, WATCHED, MANAGED])
+LIFECYCLE_REQUESTS = (slave_commands.ReadLifecycleState, slave_commands.ChangeLifecycleState)
+#: Transitions of a lifecycle node: states before and after.
+TRANSITIONS = {"configure": ("unconfigured", "inactive"), "activate": ("inactive", "active")}
 FENCES = st.none() | st.builds(Fence, st.sampled_from([1.0, 5.0]), st.just(1.0))
 
 
@@ -518,6 +525,8 @@ class AnySlave(RuleBasedStateMachine):
         self.amending: list[tuple[InstanceId, RestartPolicy]] = []
         self.unsettled: set[tuple[InstanceId, RestartPolicy]] = set()
         self.contact_at = 0.0
+        self.lifecycle_states: dict[InstanceId, str] = {}
+        self.requests: list[slave_commands.Command] = []
 
     def feed(self, event) -> None:
         for command in reducer.step(self.state, event, self.now):
@@ -526,6 +535,7 @@ class AnySlave(RuleBasedStateMachine):
                     self.check_fence(assignment)
                     self.launched.append(assignment.instance)
                     self.alive[assignment.instance] = STATE.STARTING
+                    self.lifecycle_states[assignment.instance] = "unconfigured"
             elif isinstance(command, slave_commands.Report):
                 for status in command.statuses:
                     self.reported[status.instance] = status.state
@@ -541,8 +551,17 @@ class AnySlave(RuleBasedStateMachine):
                 self.amending.append((command.instance, command.amendment))
             elif isinstance(command, slave_commands.Settle):
                 self.unsettled.discard((command.instance, command.amendment))
+            elif isinstance(command, LIFECYCLE_REQUESTS):
+                self.request(command)
             elif isinstance(command, slave_commands.Forget):
                 assert not self.alive.keys() & set(command.instances), "a live one forgotten"
+
+    def request(self, command) -> None:
+        if isinstance(command, slave_commands.ChangeLifecycleState):
+            before, _ = TRANSITIONS[command.transition]
+            found = self.lifecycle_states[command.instance]
+            assert found == before, "a transition that ends a node of rclpy"
+        self.requests.append(command)
 
     def check_fence(self, assignment) -> None:
         fence = assignment.fence
@@ -599,6 +618,21 @@ class AnySlave(RuleBasedStateMachine):
     def see(self, spec, number) -> None:
         self.feed(SeenInGraph(InstanceId(spec.name, number)))
 
+    @precondition(lambda self: self.requests)
+    @rule(data=st.data(), is_lost=st.booleans())
+    def answer(self, data, is_lost) -> None:
+        """Let a lifecycle node handle one of the requests to it; the answer may be lost."""
+        request = data.draw(st.sampled_from(self.requests))
+        self.requests.remove(request)
+        instance, pid = request.instance, request.pid
+        if isinstance(request, slave_commands.ReadLifecycleState):
+            event = LifecycleStateRead(instance, pid, self.lifecycle_states[instance], request.at)
+        else:
+            self.lifecycle_states[instance] = TRANSITIONS[request.transition][1]
+            event = TransitionAnswered(instance, pid, request.transition, succeeded=True)
+        if not is_lost:
+            self.feed(event)
+
     @rule(number=NUMBERS, pid=st.sampled_from([7, 7, 7, 8]), runs=st.booleans())
     def look(self, number, pid, runs) -> None:
         """Report unhealthy looks at the present or another run for longer than is allowed."""
@@ -630,6 +664,9 @@ class AnySlave(RuleBasedStateMachine):
         else:
             self.alive[instance] = state
         pid = 7 if state in (STATE.RUNNING, STATE.STOPPING) else 0
+        if state is not STATE.RUNNING:
+            self.lifecycle_states[instance] = "unconfigured"
+            self.requests = [one for one in self.requests if one.instance != instance]
         self.feed(SupervisorReported((InstanceStatus(instance, state, pid),)))
 
     @invariant()
@@ -659,6 +696,18 @@ class AnySlave(RuleBasedStateMachine):
         for held in self.state.watched().values():
             assert held.status.state is STATE.READY
             assert held.status.pid
+
+    @invariant()
+    def only_running_ones_are_steered(self) -> None:
+        for held in self.state.held.values():
+            if held.steering is not None:
+                assert held.status.state in (STATE.RUNNING, STATE.READY)
+
+    @invariant()
+    def managed_nodes_are_active_when_they_are_ready(self) -> None:
+        for instance, held in self.state.held.items():
+            if held.lifecycle is not None and held.status.state is STATE.READY:
+                assert self.lifecycle_states[instance] == "active"
 
     @invariant()
     def only_running_ones_are_awaited(self) -> None:

@@ -1,0 +1,150 @@
+"""Lifecycle nodes on the way to the state that their spec requires.
+
+The slave reads the state of a node and requests one transition after the other until the node has
+reached its goal. The state decides, not the history: so a node that a former run of this slave has
+configured, or that has activated itself, is not configured again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+from rosrm.core.slave import commands, events
+from rosrm.core.slave.health import resolve
+from rosrm.core.slave.state import HeldInstance, Steering
+from rosrm.core.slave.watches import ManagedLifecycle, Transition
+from rosrm.model.values import Assignment
+
+#: Seconds between two requests for the state of a node.
+READ_PERIOD: Final = 0.2
+#: State and goal to the next transition.
+_NEXT: Final[Mapping[tuple[str, str], Transition]] = MappingProxyType(
+    {
+        ("unconfigured", "inactive"): "configure",
+        ("unconfigured", "active"): "configure",
+        ("inactive", "active"): "activate",
+        ("active", "inactive"): "deactivate",
+    }
+)
+#: State after each transition.
+_AFTER: Final[Mapping[Transition, str]] = MappingProxyType(
+    {"configure": "inactive", "activate": "active", "deactivate": "inactive"}
+)
+#: State that no transition leaves.
+_FINAL: Final = "finalized"
+_SCHEME: Final = "rosservice://"
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Result of an event for a node on the way to its goal.
+
+    Attributes:
+        commands: requests to the node.
+        reached: the node has reached its goal.
+        fault: why the node cannot reach its goal; "": it can.
+    """
+
+    commands: tuple[commands.Command, ...] = ()
+    reached: bool = False
+    fault: str = ""
+
+
+_NOTHING: Final = Step()
+
+
+def managed(assignment: Assignment) -> ManagedLifecycle | None:
+    """Return the goal of an instance's node; None: the slave does not change its state.
+
+    A restored node is in the state in which it was frozen.
+    """
+    spec = assignment.spec
+    policy, node = spec.lifecycle, assignment.node_name or spec.node
+    if not policy.is_managed or assignment.restored:
+        return None
+    get_state, change_state = (
+        resolve(f"~/{service}", spec.namespace, node, spec.remappings, _SCHEME)
+        for service in ("get_state", "change_state")
+    )
+    return ManagedLifecycle(policy.autostart, get_state, change_state, policy.timeout)
+
+
+def begin(held: HeldInstance, lifecycle: ManagedLifecycle, now: float) -> Step:
+    """Request the state of a node that is in the graph."""
+    held.steering = Steering(now, now + lifecycle.timeout, now)
+    return _read(held, lifecycle, now)
+
+
+def state_read(held: HeldInstance, event: events.LifecycleStateRead, now: float) -> Step:
+    """Take the state that a node reports; the answer to a transition may be lost."""
+    steering, lifecycle = held.steering, held.lifecycle
+    if steering is None or lifecycle is None or event.asked_at < steering.began:
+        return _NOTHING
+    steering.state = event.state
+    if steering.transition and event.state not in (_AFTER[steering.transition], _FINAL):
+        return _NOTHING
+    return _arrived(held, steering, lifecycle, now)
+
+
+def transition_answered(held: HeldInstance, event: events.TransitionAnswered, now: float) -> Step:
+    """Take the answer to a transition."""
+    steering, lifecycle = held.steering, held.lifecycle
+    if steering is None or lifecycle is None or steering.transition != event.transition:
+        return _NOTHING
+    if not event.succeeded:
+        where = f" from the state {steering.state}" if steering.state else ""
+        return _fault(f"the lifecycle transition {event.transition}{where} failed in the node")
+    steering.state = _AFTER[event.transition]
+    return _arrived(held, steering, lifecycle, now)
+
+
+def time_passed(held: HeldInstance, now: float) -> Step:
+    """Request the state of a node again, or give up at the time-out."""
+    steering, lifecycle = held.steering, held.lifecycle
+    if steering is None or lifecycle is None:
+        return _NOTHING
+    if now >= steering.deadline:
+        return _fault(_time_out(steering, lifecycle))
+    if now - steering.read_at < READ_PERIOD:
+        return _NOTHING
+    steering.read_at = now
+    return _read(held, lifecycle, now)
+
+
+def _arrived(
+    held: HeldInstance, steering: Steering, lifecycle: ManagedLifecycle, now: float
+) -> Step:
+    """Request the next transition of a node in a known state; the goal may be reached."""
+    steering.transition = None
+    if steering.state == lifecycle.goal:
+        return Step(reached=True)
+    if steering.state == _FINAL:
+        return _fault(f"its lifecycle state is {_FINAL}; {lifecycle.goal} is required")
+    transition = _NEXT.get((steering.state, lifecycle.goal))
+    if transition is None:  # the node is in a transition that it began itself
+        return _NOTHING
+    steering.transition, steering.deadline = transition, now + lifecycle.timeout
+    status = held.status
+    change = commands.ChangeLifecycleState(status.instance, status.pid, lifecycle, transition)
+    return Step((change,))
+
+
+def _read(held: HeldInstance, lifecycle: ManagedLifecycle, now: float) -> Step:
+    status = held.status
+    return Step((commands.ReadLifecycleState(status.instance, status.pid, lifecycle, now),))
+
+
+def _fault(reason: str) -> Step:
+    return Step(fault=f"not ready: {reason}")
+
+
+def _time_out(steering: Steering, lifecycle: ManagedLifecycle) -> str:
+    limit = f"{lifecycle.timeout:g} s"
+    if steering.transition:
+        return f"the lifecycle transition {steering.transition} took longer than {limit}"
+    if steering.state:
+        return f"its lifecycle state was {steering.state} for {limit}; {lifecycle.goal} is required"
+    return f"no answer from {lifecycle.get_state} within {limit}"
