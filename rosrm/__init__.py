@@ -39,7 +39,7 @@ Plugins         hookimpl, NoOptions, SkipPlugin
   launchers     LauncherOffer, Launcher, LauncherContext, Launch, ProcessTreeLauncher,
                 GraphDepartureLauncher, ImageLauncher
   plans         Move, Plan, Step, Start, AwaitReady, AwaitReleased, Stop, Configure, SetRestart,
-                Commit, Execute, HandoffPhase, InstanceId
+                SetLifecycle, Commit, Execute, HandoffPhase, InstanceId
   checkpoints   CheckpointOffer, CheckpointPolicy, CheckpointView, CheckpointChoice, MemoryPacing,
                 MemoryView
   options       Seconds, PositiveSeconds, Bytes, Fraction, Count, PositiveCount, Amount,
@@ -146,6 +146,7 @@ if TYPE_CHECKING:
         HandoffPhase,
         Move,
         Plan,
+        SetLifecycle,
         SetRestart,
         Start,
         Step,
@@ -202,9 +203,9 @@ __all__ = [
     "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
     "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RolloutPolicy",
     "RosSettings", "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy",
-    "Seconds", "Sessions", "SetRestart", "SkipPlugin", "SpecChecking", "StandbyPolicy", "Start",
-    "StartOrder", "Step", "Stop", "StopPolicy", "Target", "VersionRow", "WaitResult",
-    "__version__", "hookimpl", "load_work", "options_of",
+    "Seconds", "Sessions", "SetLifecycle", "SetRestart", "SkipPlugin", "SpecChecking",
+    "StandbyPolicy", "Start", "StartOrder", "Step", "Stop", "StopPolicy", "Target", "VersionRow",
+    "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -237,7 +238,7 @@ _NAMES: Final = {
     "model.modes": "ModeRow",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
-        "SetRestart Start Step Stop"
+        "SetLifecycle SetRestart Start Step Stop"
     ),
     "model.ros_settings": "RosSettings",
     "model.rows": "DeviceRow EventRow HostRow Listing PluginRow ProcessRow ResourceRow",

@@ -132,7 +132,7 @@ class MigrationSettings:
     """
 
     strategies: Annotated[Mapping[str, Options], OptionsByName()] = field(
-        default_factory=lambda: {"relaunch": {}, "handoff": {}}
+        default_factory=lambda: {"relaunch": {}, "handoff": {}, "lifecycle_node": {}}
     )
     cooldown: Seconds = _CORE.cooldown
     hysteresis: Seconds = _CORE.hysteresis

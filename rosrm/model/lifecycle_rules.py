@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from rosrm.model.values import ProcessSpec
+from typing import Final
+
+from rosrm.model.values import InstanceId, ProcessSpec
+
+#: Services of a lifecycle node by which its slave reads and changes its state.
+_SERVICES: Final = ("get_state", "change_state")
 
 
 def lifecycle_fault(spec: ProcessSpec) -> str:
@@ -21,3 +26,14 @@ def lifecycle_fault(spec: ProcessSpec) -> str:
             "`readiness: running` does not wait for that"
         )
     return ""
+
+
+def own_services(spec: ProcessSpec, instance: InstanceId) -> dict[str, str]:
+    """Return remappings that give a managed lifecycle node services of its own.
+
+    The destination of a move has the name of its source. In DDS both would execute a request to a
+    service of one name, and a node of rclpy ends if it cannot make the requested transition.
+    """
+    if not spec.lifecycle.is_managed:
+        return {}
+    return {f"~/{name}": f"~/instance_{instance.number}/{name}" for name in _SERVICES}

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.model.links import MEASURE_SECONDS, LinkPeer
-from rosrm.model.values import EMPTY, Amendment, Assignment, InstanceId
+from rosrm.model.values import EMPTY, Amendment, Assignment, InstanceId, LifecycleGoal
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +53,14 @@ class AmendInstance:
 
     instance: InstanceId
     amendment: Amendment
+
+
+@dataclass(frozen=True, slots=True)
+class SetLifecycleState:
+    """Bring the lifecycle node of an instance to a state, now and after each restart."""
+
+    instance: InstanceId
+    state: LifecycleGoal
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +122,13 @@ class MeasureLinks:
 
 #: Orders to the slave's core.
 InstanceOrder = (
-    StartInstance | StopInstance | FenceInstance | RestartInstance | AmendInstance | ReportInstances
+    StartInstance
+    | StopInstance
+    | FenceInstance
+    | RestartInstance
+    | AmendInstance
+    | SetLifecycleState
+    | ReportInstances
 )
 Order = (
     InstanceOrder | RunExecutor | ReplicateSnapshot | DropReplica | ReloadSettings | MeasureLinks

@@ -14,7 +14,7 @@ from math import inf
 from typing import Any, ClassVar, Final
 
 from rosrm.model.codec import ByName
-from rosrm.model.values import EMPTY, InstanceId, ProcessSpec, RestartPolicy
+from rosrm.model.values import EMPTY, InstanceId, LifecycleGoal, ProcessSpec, RestartPolicy
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,9 @@ class Start:
 
     A shadow is the destination of a handoff: it has an alias, stays silent, and is not restarted. A
     restored instance starts from an image of the frozen source, which earlier steps have copied to
-    the host; it is not restarted either. `remappings` are added to those of the spec.
+    the host; it is not restarted either. An inactive instance has a lifecycle node that its slave
+    configures, and does not activate before a `SetLifecycle`. `remappings` are added to those of
+    the spec.
     """
 
     KIND: ClassVar = "start"
@@ -113,6 +115,7 @@ class Start:
     shadow: bool = False
     remappings: Mapping[str, str] = field(default_factory=dict)
     restored: bool = False
+    inactive: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,6 +188,22 @@ class SetRestart:
 
 
 @dataclass(frozen=True, slots=True)
+class SetLifecycle:
+    """Bring a lifecycle node to a state, now and after each restart; done when it is there.
+
+    Only nodes with `lifecycle` in their spec, whose slave makes their transitions.
+    """
+
+    KIND: ClassVar = "set_lifecycle"
+
+    instance: InstanceId
+    host: str
+    state: LifecycleGoal
+    timeout: float
+    undo: Step | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Commit:
     """Make the destination the owner of the name; each plan has one commit.
 
@@ -216,7 +235,10 @@ class Execute:
     undo: Step | None = None
 
 
-Step = Start | AwaitReady | AwaitReleased | Stop | Configure | SetRestart | Commit | Execute
+Step = (
+    Start | AwaitReady | AwaitReleased | Stop | Configure | SetRestart | SetLifecycle | Commit
+    | Execute
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,6 +291,9 @@ def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:
     ]  # fmt: skip
     if not begun:
         return "it commits to a destination that it never starts or awaits"
+    activated = any(isinstance(one, SetLifecycle) and one.state == "active" for one in before)
+    if any(isinstance(one, Start) and one.inactive for one in begun) and not activated:
+        return "it commits to an inactive destination"
     if aim is Aim.RESTORE and not any(isinstance(one, Start) and one.restored for one in begun):
         return "a restore starts the destination without its image"
     return ""
@@ -300,7 +325,15 @@ def _step_fault(step: Step, move: Move) -> str:
         return "restores an instance that is not the destination"
     if isinstance(step, Start) and step.shadow:
         return _shadow_fault(step, move)
-    return ""
+    return _lifecycle_fault(step, move)
+
+
+def _lifecycle_fault(step: Step, move: Move) -> str:
+    """Return why the slave cannot do a step, because it does not manage the lifecycle."""
+    if not isinstance(step, SetLifecycle) and not (isinstance(step, Start) and step.inactive):
+        return ""
+    spec = move.spec if step.instance == move.source else move.destination_spec
+    return "" if spec.lifecycle.is_managed else "needs `lifecycle` in the spec of the process"
 
 
 def _shadow_fault(step: Start, move: Move) -> str:

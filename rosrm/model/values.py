@@ -52,6 +52,7 @@ GroupEnd = Literal["never", "on-failure", "always"]
 RealtimePolicy = Literal["", "fifo", "rr"]
 #: State to which a slave brings a lifecycle node; "unmanaged": it does not.
 Autostart = Literal["active", "inactive", "unmanaged"]
+LifecycleGoal = Literal["active", "inactive"]
 
 
 class Kind(str, Enum):
@@ -549,6 +550,8 @@ class Assignment:
         state_key: key by which slaves encrypt the replicas of the process's snapshots; b"": they
             are not encrypted.
         devices: units of its host that it holds while it runs.
+        inactive: True for the destination of a move whose lifecycle node is configured, and not
+            activated until an order to its slave.
     """
 
     instance: InstanceId
@@ -562,6 +565,7 @@ class Assignment:
     restored: bool = False
     state_key: bytes = field(default=b"", repr=False)
     devices: tuple[HeldDevice, ...] = ()
+    inactive: bool = False
 
     @property
     def has_snapshots(self) -> bool:

@@ -33,6 +33,7 @@ from rosrm.model.orders import (
     ReportInstances,
     RestartInstance,
     RunExecutor,
+    SetLifecycleState,
     StartInstance,
     StopInstance,
 )
@@ -57,6 +58,7 @@ _ORDERS: Final[Mapping[type[Order], str]] = MappingProxyType(
         FenceInstance: "fence",
         RestartInstance: "restart",
         AmendInstance: "set_restart",  # its name in rosrm 0.1.0
+        SetLifecycleState: "set_lifecycle",
         RunExecutor: "execute",
         ReportInstances: "report",
     }

@@ -538,6 +538,7 @@ def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
         restored=assignment.restored, state_key=array("B", assignment.state_key),
         spec=spec_to_msg(assignment.spec),
         devices=[_to_msg(msg.HeldDevice, one) for one in assignment.devices],
+        inactive=assignment.inactive,
     )  # fmt: skip
 
 
@@ -558,6 +559,7 @@ def assignment_from_msg(message: msg.Assignment) -> values.Assignment:
         instance_from_msg(message.instance), spec_from_msg(message.spec), message.epoch,
         message.node_name, message.shadow, fence, tuple(message.snapshot_hosts),
         message.snapshots_from, message.restored, bytes(message.state_key), _held(message),
+        message.inactive,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Final
+from typing import Final, get_args
 
 from rosrm.errors import Refused
 from rosrm.model.description_checks import name_fault
@@ -21,10 +21,11 @@ from rosrm.model.orders import (
     ReportInstances,
     RestartInstance,
     RunExecutor,
+    SetLifecycleState,
     StartInstance,
     StopInstance,
 )
-from rosrm.model.values import Amendment, InstanceId
+from rosrm.model.values import Amendment, InstanceId, LifecycleGoal
 from rosrm.ros import convert
 from rosrm_msgs import srv
 
@@ -36,6 +37,7 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     RunExecutor: _Request.EXECUTE,
     ReportInstances: _Request.REPORT,
     AmendInstance: _Request.AMEND,
+    SetLifecycleState: _Request.SET_LIFECYCLE,
     FenceInstance: _Request.FENCE,
     ReplicateSnapshot: _Request.REPLICATE,
     DropReplica: _Request.DROP_REPLICA,
@@ -45,6 +47,10 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
 #: Orders by an instance alone.
 _OF_INSTANCE: Final[Mapping[int, Callable[[InstanceId], Order]]] = {
     _ACTIONS[kind]: kind for kind in (StopInstance, RestartInstance, FenceInstance, DropReplica)
+}
+#: Orders without fields.
+_ALONE: Final[Mapping[int, Callable[[], Order]]] = {
+    _ACTIONS[kind]: kind for kind in (ReportInstances, ReloadSettings)
 }
 
 
@@ -68,6 +74,8 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
             request.restart = convert.restart_to_msg(amendment.restart)
             if amendment.limits is not None:
                 request.limits = [convert.limits_to_msg(amendment.limits)]
+        case SetLifecycleState(_, state):
+            request.lifecycle = state
         case ReplicateSnapshot(_, hosts, every):
             request.replicate_to, request.replicate_every = list(hosts), float(every)
     request.instance = convert.instance_to_msg(order.instance)
@@ -80,6 +88,8 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
     fault = _fault(request)
     if fault:
         raise Refused(fault)
+    if request.action in _ALONE:
+        return _ALONE[request.action]()
     match request.action:
         case _Request.START:
             return StartInstance(convert.assignment_from_msg(request.assignment))
@@ -88,12 +98,10 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
             return RunExecutor(request.executor, arguments, request.timeout)
         case _Request.MEASURE_LINKS:
             return _measure_links(request.arguments)
-        case _Request.REPORT:
-            return ReportInstances()
-        case _Request.RELOAD:
-            return ReloadSettings()
         case _Request.AMEND:
             return AmendInstance(instance, _amendment(request))
+        case _Request.SET_LIFECYCLE:
+            return _set_lifecycle(instance, request.lifecycle)
         case _Request.REPLICATE:
             return ReplicateSnapshot(instance, tuple(request.replicate_to), request.replicate_every)
     if request.action not in _OF_INSTANCE:
@@ -104,6 +112,14 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
 def _amendment(request: srv.ControlHost.Request) -> Amendment:
     (limits,) = map(convert.limits_from_msg, request.limits) if request.limits else (None,)
     return Amendment(convert.restart_from_msg(request.restart), limits)
+
+
+def _set_lifecycle(instance: InstanceId, state: str) -> SetLifecycleState:
+    for goal in get_args(LifecycleGoal):
+        if state == goal:
+            return SetLifecycleState(instance, goal)
+    allowed = ", ".join(get_args(LifecycleGoal))
+    raise Refused(f"a lifecycle state {state!r:.100}; allowed: {allowed}")
 
 
 def _measure_links(arguments: str) -> MeasureLinks:

@@ -29,7 +29,7 @@ from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
-from rosrm.model.orders import AmendInstance, MeasureLinks, RunExecutor
+from rosrm.model.orders import AmendInstance, MeasureLinks, RunExecutor, SetLifecycleState
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -38,6 +38,7 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    LifecycleGoal,
 )
 from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
@@ -124,6 +125,7 @@ class SlaveRuntime:
         self._events: deque[Event] = deque()
         self._from_threads: deque[Callable[[], None]] = deque()
         self._unsettled: dict[tuple[InstanceId, Amendment], list[Settled]] = {}
+        self._unreached: dict[tuple[InstanceId, LifecycleGoal], list[Settled]] = {}
         self._executors = Executors(
             registry.executors(config.strategies), registry.broken_strategies(),
             post=self._post, changed=self._note_executors,
@@ -241,8 +243,8 @@ class SlaveRuntime:
             report=lambda one, reason: self._take(StartDelayed(one, reason)),
         )  # fmt: skip
         duties = Duties(
-            self._take, self._amend, self._replication.keep, self._drop_snapshots,
-            self._execute, self._read_log, self._measure_links, self._reload,
+            self._take, self._amend, self._set_lifecycle, self._replication.keep,
+            self._drop_snapshots, self._execute, self._read_log, self._measure_links, self._reload,
         )  # fmt: skip
         SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
 
@@ -509,6 +511,9 @@ class SlaveRuntime:
         elif isinstance(command, commands.Settle):
             for settled in self._unsettled.pop((command.instance, command.amendment), []):
                 settled(command.refusal, command.code)
+        elif isinstance(command, commands.SettleLifecycle):
+            for settled in self._unreached.pop((command.instance, command.goal), []):
+                settled(command.refusal, command.code)
         elif isinstance(command, commands.ReadLifecycleState | commands.ChangeLifecycleState):
             self._participant.guard.call(self._lifecycle_clients.send, command, time.monotonic())
         else:
@@ -535,6 +540,11 @@ class SlaveRuntime:
     def _amend(self, order: AmendInstance, settled: Settled) -> None:
         """Change an instance; call `settled` when the supervisor has recorded or refused it."""
         self._unsettled.setdefault((order.instance, order.amendment), []).append(settled)
+        self._take(event_of(order))
+
+    def _set_lifecycle(self, order: SetLifecycleState, settled: Settled) -> None:
+        """Change the goal of a lifecycle node; call `settled` when the node has reached it."""
+        self._unreached.setdefault((order.instance, order.state), []).append(settled)
         self._take(event_of(order))
 
     def _drop_snapshots(self, instance: InstanceId) -> None:

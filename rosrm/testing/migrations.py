@@ -202,7 +202,7 @@ class MigrationContract:
                 if isinstance(step, Stop) and step.instance == move.source:
                     stopped = True
                 if isinstance(step, Start) and step.instance == move.destination and not stopped:
-                    same_name = step.node_name in ("", move.spec.node)
+                    same_name = step.node_name in ("", move.spec.node) and not step.inactive
                     assert plan.overlap > 0 or not same_name, (
                         "the destination starts before the source has stopped, and the plan "
                         "declares no overlap"

@@ -14,11 +14,12 @@ from rosrm.model.plan import (
     Execute,
     HandoffPhase,
     Plan,
+    SetLifecycle,
     SetRestart,
     Start,
     Stop,
 )
-from rosrm.model.values import ProcessSpec, RestartPolicy
+from rosrm.model.values import LifecyclePolicy, ProcessSpec, RestartPolicy
 from rosrm.testing import MigrationContract
 from rosrm_criu import plugin as criu
 from rosrm_migration import plugin
@@ -32,6 +33,31 @@ OFFERS = {
 
 class TestRelaunch(MigrationContract):
     offer = OFFERS["relaunch"]
+
+
+class TestLifecycleNode(MigrationContract):
+    offer = OFFERS["lifecycle_node"]
+    spec = ProcessSpec("p", command=("true",), ros=True, lifecycle=LifecyclePolicy("active"))
+
+    def test_the_source_is_inactive_before_the_destination_is_active(self):
+        """On the way back the destination ends before the source is activated again."""
+        move = self.moves()[0]
+        plan = self.offer.create(self.offer.options()).propose(move)
+        off, on = (step for step in plan.steps if isinstance(step, SetLifecycle))
+        assert (off.instance, off.state, off.undo.state) == (move.source, "inactive", "active")
+        assert (on.instance, on.state) == (move.destination, "active")
+        assert isinstance(on.undo, Stop)
+        assert on.undo.instance == move.destination
+        assert plan.overlap == 0.0
+
+    @pytest.mark.parametrize("autostart", ["inactive", "unmanaged"])
+    def test_a_node_that_its_host_does_not_activate_is_refused(self, autostart):
+        """Another program would activate the node during the move."""
+        spec = replace(self.spec, lifecycle=LifecyclePolicy(autostart))
+        strategy = self.offer.create(self.offer.options())
+        assert "set `lifecycle: active`" in strategy.spec_fault(spec)
+        with pytest.raises(ValueError, match="set `lifecycle: active`"):
+            strategy.propose(replace(self.moves()[0], spec=spec))
 
 
 class TestHandoff(MigrationContract):

@@ -4,20 +4,27 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 
 import pytest
 
-from rosrm.model.values import LifecyclePolicy, ProcessSpec, RestartPolicy
-from tests.ros.clusters import SPIN, alive, host, node
-from tests.waiting import PATIENCE
+from rosrm.config.settings import MigrationSettings, ProcessDefaults
+from rosrm.model.values import LifecyclePolicy, MigrationPolicy, ProcessSpec, RestartPolicy
+from tests.ros.clusters import MIB, SPIN, alive, host, node
+from tests.waiting import PATIENCE, wait_gone
 
 AGAIN = RestartPolicy("on-failure", delay=0.2)
+MOVES = MigrationPolicy("lifecycle_node")
+#: Seconds between the two transitions of a move: far more than they take on a busy machine, and
+#: less than the start of a node.
+SHORT = 1.0
 
 #: A lifecycle node that prints its transitions. `fails`: name of a transition that fails; `hangs`:
-#: of one that never ends.
+#: of one that never ends. `notes`: file for the pid, the transition and its time; `home`: file with
+#: the name of the host on which `fails` does not apply; nothing fails before the file exists.
 MANAGED = (
     """
-import time, rclpy
+import os, time, rclpy
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 
 class Managed(LifecycleNode):
@@ -25,12 +32,19 @@ class Managed(LifecycleNode):
         super().__init__("unnamed")
         self.fails = self.declare_parameter("fails", "").value
         self.hangs = self.declare_parameter("hangs", "").value
+        self.notes = self.declare_parameter("notes", "").value
+        self.home = self.declare_parameter("home", "").value
 
     def go(self, transition):
         print(transition, flush=True)
+        if self.notes:
+            with open(self.notes, "a") as notes:
+                notes.write(f"{os.getpid()} {transition} {time.monotonic()}\\n")
         while self.hangs == transition:
             time.sleep(0.1)
-        failed = self.fails == transition
+        home = open(self.home).read() if os.path.exists(self.home) else ""
+        failed = self.fails == transition and (home or not self.home)
+        failed = failed and home != os.environ["ROSRM_HOST"]
         return TransitionCallbackReturn.FAILURE if failed else TransitionCallbackReturn.SUCCESS
 
     def on_configure(self, state):
@@ -38,6 +52,9 @@ class Managed(LifecycleNode):
 
     def on_activate(self, state):
         return self.go("activate")
+
+    def on_deactivate(self, state):
+        return self.go("deactivate")
 
 rclpy.init()
 node = Managed()
@@ -48,8 +65,12 @@ node = Managed()
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """Yield a cluster of one host."""
-    return make_shared(host("h0"))
+    """Yield a cluster of two hosts, without automatic migration."""
+    return make_shared(
+        host("left"), host("right"),
+        migration=MigrationSettings(automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
 
 
 def managed(name: str, autostart="active", timeout: float = PATIENCE, **options) -> ProcessSpec:
@@ -101,3 +122,64 @@ def test_a_transition_that_fails_or_hangs(cluster, name, parameters, timeout, re
     row = cluster.ended(name)
     assert (row.state, row.reason) == ("failed", f"not ready: {reason}")
     assert not alive(row.pid)
+
+
+# --- moves ------------------------------------------------------------------------------------
+
+
+def noted(notes: Path) -> list[tuple[int, str, float]]:
+    """Return pid, transition and time of all transitions, in order."""
+    lines = [line.split() for line in notes.read_text().splitlines()]
+    return [(int(pid), transition, float(at)) for pid, transition, at in lines]
+
+
+def test_a_node_moves_with_a_short_gap(cluster, tmp_path) -> None:
+    """It is configured there, deactivated here, activated there, and ends here; also once more."""
+    notes = tmp_path / "notes"
+    parameters = {"notes": str(notes)}
+    cluster.submit(managed("walker", parameters=parameters, migration=MOVES, restart=AGAIN))
+    before = cluster.wait("walker", "running")
+    for moves in (1, 2):
+        cluster.client.migrate("walker")
+        after = cluster.wait("walker", "running", migrations=moves)
+        assert after.host != before.host
+        wait_gone(before.pid)
+        first, second, third = noted(notes)[-3:]
+        assert (first[:2], second[:2]) == ((after.pid, "configure"), (before.pid, "deactivate"))
+        assert third[:2] == (after.pid, "activate")
+        assert third[2] - second[2] < SHORT
+        before = after
+    cluster.cancel("walker")
+
+
+def test_a_moved_node_is_activated_after_a_restart(cluster) -> None:
+    """The goal of the destination is `active` from the move on."""
+    cluster.submit(managed("runner", migration=MOVES, restart=AGAIN))
+    before = cluster.wait("runner", "running")
+    cluster.client.migrate("runner")
+    after = cluster.wait("runner", "running", migrations=1)
+    wait_gone(before.pid)
+    os.kill(after.pid, signal.SIGKILL)
+    cluster.wait("runner", "running", restarts=1)
+    assert printed(cluster, "runner") == ["configure", "activate"] * 2
+    cluster.cancel("runner")
+
+
+def test_a_move_goes_back_if_the_destination_cannot_be_activated(cluster, tmp_path) -> None:
+    """The destination ends first; then the source is activated again, without a restart."""
+    notes, home = tmp_path / "notes", tmp_path / "home"
+    parameters = {"notes": str(notes), "home": str(home), "fails": "activate"}
+    cluster.submit(managed("stayer", parameters=parameters, migration=MOVES, restart=AGAIN))
+    before = cluster.wait("stayer", "running")
+    home.write_text(before.host)
+    cluster.client.migrate("stayer")
+    event = cluster.wait_for_event("stayed", "activate from the state inactive", process="stayer")
+    row = cluster.wait("stayer", "running")
+    assert (row.host, row.pid, row.migrations) == (before.host, before.pid, 0), event.message
+    deactivated, refused, activated = noted(notes)[-3:]
+    assert (deactivated[0], activated[0]) == (before.pid, before.pid)
+    assert [one[1] for one in (deactivated, refused, activated)] == [
+        "deactivate", "activate", "activate",
+    ]  # fmt: skip
+    assert not alive(refused[0])
+    cluster.cancel("stayer")

@@ -540,7 +540,7 @@ class MasterState:
 
     def assignment(
         self, instance: InstanceId, spec: ProcessSpec, node_name: str = "", *,
-        shadow: bool = False, restored: bool = False,
+        shadow: bool = False, restored: bool = False, inactive: bool = False,
     ) -> Assignment:  # fmt: skip
         """Return the assignment by which a slave runs an instance of a known process."""
         fence = fence_of(spec, self.settings)
@@ -554,7 +554,7 @@ class MasterState:
                 snapshot_hosts = self.replication.in_reach(spec.name, first_instance, self.hosts)
         return Assignment(
             instance, spec, self.epoch, node_name or spec.node, shadow, fence, snapshot_hosts,
-            snapshots_from, restored, devices=known.devices if known else (),
+            snapshots_from, restored, devices=known.devices if known else (), inactive=inactive,
         )  # fmt: skip
 
     def note_decision(

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 
 from rosrm.core.slave.watches import ManagedLifecycle, Memo, Transition
 from rosrm.model.orders import NOT_AMENDED
-from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
+from rosrm.model.values import (
+    Amendment,
+    Assignment,
+    InstanceId,
+    InstanceStatus,
+    LifecycleGoal,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +127,19 @@ class ChangeLifecycleState:
 
 
 @dataclass(frozen=True, slots=True)
+class SettleLifecycle:
+    """Answer the order to bring a lifecycle node to a state; `refusal`: why that failed; "": done.
+
+    One command answers all repetitions of the order.
+    """
+
+    instance: InstanceId
+    goal: LifecycleGoal
+    refusal: str = ""
+    code: str = "unable"
+
+
+@dataclass(frozen=True, slots=True)
 class Remember:
     """Order the supervisor to store facts for a later run of this slave."""
 
@@ -145,5 +164,5 @@ class Report:
 
 Command = (
     Launch | Stop | Fence | Renew | Restart | Fail | Amend | Settle | ReadLifecycleState
-    | ChangeLifecycleState | Remember | Forget | Report
+    | ChangeLifecycleState | SettleLifecycle | Remember | Forget | Report
 )  # fmt: skip

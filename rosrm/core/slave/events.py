@@ -6,7 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rosrm.core.slave.watches import Memo, Observation, Transition
-from rosrm.model.values import Amendment, Assignment, InstanceId, InstanceStatus
+from rosrm.model.values import (
+    Amendment,
+    Assignment,
+    InstanceId,
+    InstanceStatus,
+    LifecycleGoal,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +148,14 @@ class SeenInGraph:
 
 
 @dataclass(frozen=True, slots=True)
+class LifecycleOrdered:
+    """The master ordered to bring a lifecycle node to a state, now and after each restart."""
+
+    instance: InstanceId
+    goal: LifecycleGoal
+
+
+@dataclass(frozen=True, slots=True)
 class LifecycleStateRead:
     """A node reported its lifecycle state.
 
@@ -215,6 +229,7 @@ Event = (
     | SupervisorReported
     | SupervisorReplaced
     | SeenInGraph
+    | LifecycleOrdered
     | LifecycleStateRead
     | TransitionAnswered
     | LookedAt

@@ -380,16 +380,26 @@ def _after(
     """Return the commands that follow from a step of a lifecycle node to its goal."""
     if step.commands:
         return list(step.commands)
-    status = held.status
-    if step.fault:
-        held.steering = None
-        return [commands.Fail(status.instance, status.pid, step.fault, kill=False)]
-    if not step.reached:
+    if not step.reached and not step.fault:
         return []
     held.steering = None
-    if status.state is InstanceState.READY or held.awaited is None:
-        return []
-    return _ready(state, held, held.awaited, now)
+    answers = lifecycle_nodes.settled(held, step.fault)
+    status, lifecycle = held.status, held.lifecycle
+    ready = status.state is InstanceState.READY
+    if step.fault:
+        # A source that cannot be deactivated keeps running, because its move is undone.
+        if not ready or (lifecycle is not None and lifecycle.goal == "active"):
+            fault = f"not {'active' if ready else 'ready'}: {step.fault}"
+            answers.append(commands.Fail(status.instance, status.pid, fault, kill=False))
+        return answers
+    if ready or held.awaited is None:
+        return answers
+    return [*answers, *_ready(state, held, held.awaited, now)]
+
+
+def _lifecycle_ordered(state: SlaveState, event: events.LifecycleOrdered, now: float) -> _Commands:
+    held, waits = state.held.get(event.instance), event.instance in state.waiting
+    return lifecycle_nodes.ordered(held, event, now, waits=waits)
 
 
 def _looked_at(state: SlaveState, event: events.LookedAt, now: float) -> _Commands:
@@ -440,6 +450,8 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
             orders.append(commands.Stop(instance))
         elif held.steering is not None:
             orders += _after(state, held, lifecycle_nodes.time_passed(held, now), now)
+        elif held.ordered is not None and held.status.state.ended:
+            orders += lifecycle_nodes.settled(held, "it has ended")
         elif held.status.state.ended and _may_be_discarded(state, held, now):
             forgotten.append(instance)
     if forgotten:
@@ -470,6 +482,7 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.SupervisorReported: _supervisor_reported,
         events.SupervisorReplaced: _supervisor_replaced,
         events.SeenInGraph: _seen,
+        events.LifecycleOrdered: _lifecycle_ordered,
         events.LifecycleStateRead: _state_read,
         events.TransitionAnswered: _transition_answered,
         events.LookedAt: _looked_at,

@@ -39,7 +39,7 @@ def watch_of(assignment: Assignment) -> Watch | None:
         _names(wanted.topic, assignment, "rostopic://") if wanted.topic else (),
         _names("~/get_state", assignment, "rosservice://") if wanted.lifecycle else (),
         restarts=assignment.spec.restart.when != "never",
-        paused=assignment.on_trial,
+        paused=assignment.on_trial or assignment.inactive,
     )
 
 

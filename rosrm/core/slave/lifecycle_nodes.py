@@ -8,7 +8,7 @@ configured, or that has activated itself, is not configured again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
@@ -16,7 +16,7 @@ from rosrm.core.slave import commands, events
 from rosrm.core.slave.health import resolve
 from rosrm.core.slave.state import HeldInstance, Steering
 from rosrm.core.slave.watches import ManagedLifecycle, Transition
-from rosrm.model.values import Assignment
+from rosrm.model.values import Assignment, InstanceState, LifecycleGoal
 
 #: Seconds between two requests for the state of a node.
 READ_PERIOD: Final = 0.2
@@ -30,7 +30,7 @@ _NEXT: Final[Mapping[tuple[str, str], Transition]] = MappingProxyType(
     }
 )
 #: State after each transition.
-_AFTER: Final[Mapping[Transition, str]] = MappingProxyType(
+STATE_AFTER: Final[Mapping[Transition, str]] = MappingProxyType(
     {"configure": "inactive", "activate": "active", "deactivate": "inactive"}
 )
 #: State that no transition leaves.
@@ -69,7 +69,41 @@ def managed(assignment: Assignment) -> ManagedLifecycle | None:
         resolve(f"~/{service}", spec.namespace, node, spec.remappings, _SCHEME)
         for service in ("get_state", "change_state")
     )
-    return ManagedLifecycle(policy.autostart, get_state, change_state, policy.timeout)
+    goal: LifecycleGoal = "active"
+    if assignment.inactive or policy.autostart == "inactive":
+        goal = "inactive"
+    return ManagedLifecycle(goal, get_state, change_state, policy.timeout)
+
+
+def ordered(
+    held: HeldInstance | None, event: events.LifecycleOrdered, now: float, *, waits: bool
+) -> list[commands.Command]:
+    """Change the goal of a node; the answer follows when the node has reached it.
+
+    The health checks are paused while the node is inactive, because it may be silent.
+
+    Args:
+        waits: the instance waits for its start, and the supervisor does not know it.
+    """
+    if held is None or held.lifecycle is None or held.status.state.ended:
+        why = "its host does not change the lifecycle state of its node, or it has ended"
+        return [commands.SettleLifecycle(event.instance, event.goal, why)]
+    answers = settled(held, "another state was ordered") if held.ordered != event.goal else []
+    held.ordered = event.goal
+    if held.lifecycle.goal != event.goal:
+        held.lifecycle = replace(held.lifecycle, goal=event.goal)
+        if held.watch is not None:
+            held.watch, held.judgement = replace(held.watch, paused=event.goal != "active"), None
+        answers += [] if waits else [commands.Remember(event.instance, held.memo)]
+    if held.status.state is InstanceState.READY and held.steering is None:
+        answers += begin(held, held.lifecycle, now).commands
+    return answers
+
+
+def settled(held: HeldInstance, refusal: str = "") -> list[commands.Command]:
+    """Answer the order of the master, if there is one."""
+    goal, held.ordered = held.ordered, None
+    return [] if goal is None else [commands.SettleLifecycle(held.status.instance, goal, refusal)]
 
 
 def begin(held: HeldInstance, lifecycle: ManagedLifecycle, now: float) -> Step:
@@ -84,7 +118,7 @@ def state_read(held: HeldInstance, event: events.LifecycleStateRead, now: float)
     if steering is None or lifecycle is None or event.asked_at < steering.began:
         return _NOTHING
     steering.state = event.state
-    if steering.transition and event.state not in (_AFTER[steering.transition], _FINAL):
+    if steering.transition and event.state not in (STATE_AFTER[steering.transition], _FINAL):
         return _NOTHING
     return _arrived(held, steering, lifecycle, now)
 
@@ -97,7 +131,7 @@ def transition_answered(held: HeldInstance, event: events.TransitionAnswered, no
     if not event.succeeded:
         where = f" from the state {steering.state}" if steering.state else ""
         return _fault(f"the lifecycle transition {event.transition}{where} failed in the node")
-    steering.state = _AFTER[event.transition]
+    steering.state = STATE_AFTER[event.transition]
     return _arrived(held, steering, lifecycle, now)
 
 
@@ -138,7 +172,7 @@ def _read(held: HeldInstance, lifecycle: ManagedLifecycle, now: float) -> Step:
 
 
 def _fault(reason: str) -> Step:
-    return Step(fault=f"not ready: {reason}")
+    return Step(fault=reason)
 
 
 def _time_out(steering: Steering, lifecycle: ManagedLifecycle) -> str:

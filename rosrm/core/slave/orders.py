@@ -22,5 +22,7 @@ def event_of(order: orders.InstanceOrder, given_at: float | None = None) -> even
             return events.RestartOrdered(instance)
         case orders.AmendInstance(instance, amendment):
             return events.AmendmentOrdered(instance, amendment)
+        case orders.SetLifecycleState(instance, state):
+            return events.LifecycleOrdered(instance, state)
         case orders.ReportInstances():
             return events.ReportRequested()

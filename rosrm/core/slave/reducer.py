@@ -23,6 +23,8 @@ SupervisorReplaced      the same; drops the instances that the new supervisor do
                         reports all instances, and repeats orders that may be lost
 SeenInGraph             marks the instance as ready, also for a later run of this slave; or reads
                         the state of a lifecycle node that the slave brings to a goal
+LifecycleOrdered        changes the goal of a lifecycle node, and reads its state; answers when the
+                        node has reached the goal
 LifecycleStateRead      requests the next transition; at the goal, marks the instance as ready
 TransitionAnswered      the same; ends the instance as failed if the transition failed
 LookedAt                ends an instance as failed if it has been unhealthy for too long

@@ -21,6 +21,7 @@ from rosrm.model.values import (
     InstanceId,
     InstanceState,
     InstanceStatus,
+    LifecycleGoal,
     ProcessSpec,
 )
 
@@ -66,6 +67,7 @@ class HeldInstance:
         artifacts: artifacts that it uses.
         lifecycle: None: the slave does not change the lifecycle state of its node.
         steering: None: its node is not in the graph, or has reached its goal.
+        ordered: goal of an order of the master that is not answered yet; None: there is none.
     """
 
     status: InstanceStatus
@@ -82,6 +84,7 @@ class HeldInstance:
     artifacts: tuple[Artifact, ...] = ()
     lifecycle: ManagedLifecycle | None = None
     steering: Steering | None = None
+    ordered: LifecycleGoal | None = None
 
     @property
     def memo(self) -> Memo:

@@ -8,7 +8,7 @@ from typing import Literal
 
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
-from rosrm.model.values import Health
+from rosrm.model.values import Health, LifecycleGoal
 
 #: Lifecycle transitions that a slave requests.
 Transition = Literal["configure", "activate", "deactivate"]
@@ -77,13 +77,12 @@ class ManagedLifecycle:
     """State to which the slave brings a lifecycle node after each start and each restart.
 
     Attributes:
-        goal: "active" or "inactive".
         get_state: absolute name of the service that returns the state.
         change_state: absolute name of the service that changes the state.
         timeout: seconds for each transition.
     """
 
-    goal: str
+    goal: LifecycleGoal
     get_state: str
     change_state: str
     timeout: float

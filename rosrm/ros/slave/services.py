@@ -19,6 +19,7 @@ from rosrm.model.orders import (
     ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
+    SetLifecycleState,
 )
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
@@ -71,6 +72,8 @@ class Duties:
         amend: changes an instance that runs on. It calls its last argument with "" when the change
             is durable, whichever process is killed, else with the reason why nothing has changed,
             and its code.
+        set_lifecycle: changes the goal of a lifecycle node. It calls its last argument with "" when
+            the node has reached the goal, else with the reason why it does not, and its code.
         keep: replicates an instance's snapshots to these hosts from now on, every so many seconds.
         drop_snapshots: deletes the snapshots of a process, of instances up to this one.
         execute: runs an executor, and calls its last argument with the outcome. If that takes
@@ -83,6 +86,7 @@ class Duties:
 
     take: Callable[[Event], None]
     amend: Callable[[AmendInstance, Callable[[str, str], None]], None]
+    set_lifecycle: Callable[[SetLifecycleState, Callable[[str, str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
@@ -113,7 +117,7 @@ class SlaveServices:
         self, request: srv.ControlHost.Request, _sealed: SealedRequest,
         respond: Callable[[Any], None],
     ) -> None:  # fmt: skip
-        """Carry out an order; the outcomes of executors and amendments come later."""
+        """Carry out an order; some outcomes, such as those of executors, come later."""
         try:
             order = order_from_msg(request)
             match order:
@@ -121,7 +125,10 @@ class SlaveServices:
                     self._execute(order, respond)
                     return
                 case AmendInstance():
-                    self._amend(order, respond)
+                    self._duties.amend(order, _settled(respond))
+                    return
+                case SetLifecycleState():
+                    self._duties.set_lifecycle(order, _settled(respond))
                     return
                 case MeasureLinks():
                     self._measure_links(order, respond)
@@ -139,13 +146,6 @@ class SlaveServices:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
-
-    def _amend(self, order: AmendInstance, respond: Callable[[Any], None]) -> None:
-        def settled(refusal: str, code: str) -> None:
-            answer = refused(code, refusal) if refusal else accepted()
-            respond(srv.ControlHost.Response(answer=answer))
-
-        self._duties.amend(order, settled)
 
     def _measure_links(self, order: MeasureLinks, respond: Callable[[Any], None]) -> None:
         def done(report: LinkReport) -> None:
@@ -194,3 +194,13 @@ class SlaveServices:
                 mark_pids=[mark[2] for mark in part.marks],
             )
         )  # fmt: skip
+
+
+def _settled(respond: Callable[[Any], None]) -> Callable[[str, str], None]:
+    """Return a function that answers an order with its refusal and code; "": it was executed."""
+
+    def settle(refusal: str, code: str) -> None:
+        answer = refused(code, refusal) if refusal else accepted()
+        respond(srv.ControlHost.Response(answer=answer))
+
+    return settle

@@ -225,7 +225,14 @@ class Machine(Host[Program]):
         )
 
     def _memos(self) -> dict[InstanceId, Memo]:
-        return {one: Memo(devices=it.assignment.devices) for one, it in self.programs.items()}
+        held = self.slave.held
+        return {
+            one: Memo(
+                devices=it.assignment.devices,
+                lifecycle=held[one].lifecycle if one in held else None,
+            )
+            for one, it in self.programs.items()
+        }
 
     def _running(self) -> list[InstanceStatus]:
         return [

@@ -7,7 +7,7 @@ that really run, independently of the core's state. After every step the invaria
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -32,6 +32,7 @@ from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
     Kind,
+    LifecyclePolicy,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
@@ -41,6 +42,7 @@ from rosrm.model.values import (
     StandbyPolicy,
     StartOrder,
 )
+from rosrm_migration.lifecycle_node import LifecycleNode, LifecycleNodeOptions
 from tests.unit.core import invariants
 from tests.unit.core.cluster import MIB, Cluster, HandOver, Machine, StartFirstOrStopFirst
 from tests.unit.core.nodes import QUIRKS, Node
@@ -55,7 +57,15 @@ LABELLED = "c"
 names = st.sampled_from([*NAMES[:1] * 4, *NAMES[:2] * 2, *NAMES])
 hosts = st.sampled_from(HOSTS)
 ways = st.sampled_from(
-    ["overlap", "stop first", "handoff", "handoff, restarted", "handoff, standby", "criu"]
+    [
+        "overlap",
+        "stop first",
+        "handoff",
+        "handoff, restarted",
+        "handoff, standby",
+        "criu",
+        "lifecycle_node",
+    ]
 )
 losses = st.sampled_from(["wait", "wait", "elsewhere", "elsewhere", "stop"])
 chance = st.booleans()
@@ -106,7 +116,8 @@ def spec(
 ) -> ProcessSpec:  # fmt: skip
     """Draw one of a few sorts of process."""
     word = moves.partition(",")[0]
-    strategy = word if word in ("handoff", "criu") else "relaunch"
+    strategy = word if word in ("handoff", "criu", "lifecycle_node") else "relaunch"
+    managed = word == "lifecycle_node" and kind == "node"
     migration = MigrationPolicy(strategy, overlap=moves == "overlap") if moves else None
     restart = RestartPolicy("on-failure" if moves == "handoff, restarted" else "never")
     standby = StandbyPolicy(wanted=moves == "handoff, standby" and kind != "job")
@@ -116,6 +127,7 @@ def spec(
         needs={"memory": memory * MIB} if memory else {},
         required_labels={"arm": "yes"} if special else {},
         migration=migration or MigrationPolicy(), restart=restart, readiness=Readiness(timeout=4.0),
+        lifecycle=LifecyclePolicy("active" if managed else "unmanaged", 1.0),
         standby=standby, reschedule=ReschedulePolicy(int(loss == "elsewhere"), 1.0),
         time_limit=6.0 if kind == "job" and memory == 100 else 0.0,
         host_loss=HostLossPolicy(loss, 1.0 if loss == "elsewhere" and memory else 0.0),
@@ -169,6 +181,7 @@ class Play(RuleBasedStateMachine):
                 "relaunch": StartFirstOrStopFirst(timeout=3.0),
                 "handoff": HandOver(timeout=3.0),
                 "criu": Everywhere(seconds=1.0),
+                "lifecycle_node": LifecycleNode(LifecycleNodeOptions()),
             },
         )  # fmt: skip
         self.cluster.state.replication.policy = OneOther()
@@ -898,7 +911,8 @@ class Play(RuleBasedStateMachine):
             overlap = all(one.spec.migration.overlap and one.spec.migration.strategy
                           for one in running)  # fmt: skip
             strategies = {one.spec.migration.strategy for one in running}
-            silent = strategies in ({"handoff"}, {"criu"})  # all but one node are silent, see below
+            # All but one node are silent, see below.
+            silent = strategies in ({"handoff"}, {"criu"}, {"lifecycle_node"})
             most = 2 if overlap or silent else 1
             most += any(one.spec.standby.wanted for one in running)
             assert len(running) <= most, [str(one.instance) for one in running]
@@ -909,6 +923,14 @@ class Play(RuleBasedStateMachine):
                 if node.instance.process == name and node.instance.number not in left
             ]  # fmt: skip
             assert sum(node.active for node in active) <= 1, [str(one.instance) for one in active]
+        managed = Counter(
+            instance.process
+            for machine in self.cluster.machines.values()
+            for instance, program in machine.programs.items()
+            if program.assignment.spec.lifecycle.is_managed
+            and program.lifecycle_state == "active" and instance.number not in left
+        )  # fmt: skip
+        assert not [name for name, active in managed.items() if active > 1]
 
     @invariant()
     def what_was_cancelled_runs_nowhere(self) -> None:

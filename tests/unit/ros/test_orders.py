@@ -23,6 +23,7 @@ from rosrm.model.orders import (
     ReportInstances,
     RestartInstance,
     RunExecutor,
+    SetLifecycleState,
     StartInstance,
     StopInstance,
 )
@@ -48,6 +49,7 @@ EVENTS = [
     (RestartInstance(ONE), happened.RestartOrdered(ONE)),
     (AmendInstance(ONE, POLICY), happened.AmendmentOrdered(ONE, POLICY)),
     (AmendInstance(ONE, LIMITED), happened.AmendmentOrdered(ONE, LIMITED)),
+    (SetLifecycleState(ONE, "inactive"), happened.LifecycleOrdered(ONE, "inactive")),
     (ReportInstances(), happened.ReportRequested()),
 ]
 ORDERS = [
@@ -119,4 +121,11 @@ def test_an_order_with_an_impossible_peer_is_refused(changes):
     request = order_to_msg(MeasureLinks())
     request.arguments = json.dumps({"peers": [{**peer, **changes}], "learn": False})
     with pytest.raises(Refused, match="an order to measure links"):
+        order_from_msg(request)
+
+
+def test_an_order_for_an_unknown_lifecycle_state_is_refused():
+    request = order_to_msg(SetLifecycleState(ONE, "active"))
+    request.lifecycle = "finalized"
+    with pytest.raises(Refused, match="'finalized'; allowed: active, inactive"):
         order_from_msg(request)

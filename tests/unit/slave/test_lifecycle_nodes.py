@@ -10,8 +10,10 @@ from rosrm.core.slave.commands import (
     ReadLifecycleState,
     Remember,
     Report,
+    SettleLifecycle,
 )
 from rosrm.core.slave.events import (
+    LifecycleOrdered,
     LifecycleStateRead,
     SeenInGraph,
     SupervisorReplaced,
@@ -21,6 +23,7 @@ from rosrm.core.slave.events import (
 from rosrm.core.slave.lifecycle_nodes import READ_PERIOD
 from rosrm.core.slave.watches import Memo
 from rosrm.model.values import (
+    Health,
     InstanceId,
     InstanceState,
     InstanceStatus,
@@ -67,9 +70,8 @@ def transitions(given) -> list[str]:
 
 
 def fault(given) -> str:
-    """Return why the only command, a `Fail`, ends the run."""
-    (failed,) = given
-    assert isinstance(failed, Fail)
+    """Return why a `Fail`, the only one, ends the run."""
+    (failed,) = [one for one in given if isinstance(one, Fail)]
     assert (failed.pid, failed.kill) == (PID, False)
     return failed.reason
 
@@ -251,3 +253,116 @@ def test_a_node_on_the_way_counts_as_starting() -> None:
     slave.assign(spec(), number=2)
     assert "max_starting" in slave.of("n", 2).status.message
     assert launched(read(slave, "active")) == [InstanceId("n", 2)]
+
+
+# --- orders of the master ---------------------------------------------------------------------
+
+
+def answers(given) -> list[tuple[str, str]]:
+    """Return goal and refusal of each answered order."""
+    return [(one.goal, one.refusal) for one in given if isinstance(one, SettleLifecycle)]
+
+
+def active(process=None) -> Slave:
+    """Return a slave whose node is active."""
+    slave = seen(process)
+    read(slave, "active")
+    return slave
+
+
+def test_an_order_is_answered_when_the_node_has_reached_the_state() -> None:
+    """The node stays ready; the memo has the goal, so that a restarted node is only configured."""
+    slave = active()
+    commands = slave.step(LifecycleOrdered(N, "inactive"))
+    assert [type(one) for one in commands] == [Remember, ReadLifecycleState]
+    assert transitions(read(slave, "active")) == ["deactivate"]
+    assert answers(answered(slave, "deactivate")) == [("inactive", "")]
+    assert slave.of("n").status.state is InstanceState.READY
+    slave.status(InstanceState.BACKOFF, "n")
+    slave.status(InstanceState.RUNNING, "n", pid=6)
+    slave.step(SeenInGraph(N))
+    slave.step(LifecycleStateRead(N, 6, "unconfigured", slave.now))
+    configured = slave.step(TransitionAnswered(N, 6, "configure", succeeded=True))
+    assert states(configured) == [InstanceState.READY]
+
+
+def test_the_destination_of_a_move_is_activated_by_an_order() -> None:
+    """It is ready when it is inactive, although its spec requires `active`."""
+    slave = Slave()
+    slave.assign(spec(), inactive=True)
+    slave.status(InstanceState.RUNNING, "n")
+    slave.step(SeenInGraph(N))
+    assert states(read(slave, "inactive")) == [InstanceState.READY]
+    slave.step(LifecycleOrdered(N, "active"))
+    assert transitions(read(slave, "inactive")) == ["activate"]
+    assert answers(answered(slave, "activate")) == [("active", "")]
+
+
+def test_a_repeated_order_is_answered_once_and_again() -> None:
+    """The runtime answers all repetitions that wait; a later repetition is answered anew."""
+    slave = active()
+    slave.step(LifecycleOrdered(N, "inactive"))
+    read(slave, "active")
+    assert slave.step(LifecycleOrdered(N, "inactive")) == []
+    assert answers(answered(slave, "deactivate")) == [("inactive", "")]
+    slave.step(LifecycleOrdered(N, "inactive"))
+    assert answers(read(slave, "inactive")) == [("inactive", "")]
+
+
+def test_a_source_that_cannot_be_deactivated_keeps_running() -> None:
+    """The order is refused with the reason, and the master undoes the move."""
+    slave = active()
+    slave.step(LifecycleOrdered(N, "inactive"))
+    read(slave, "active")
+    commands = answered(slave, "deactivate", succeeded=False)
+    reason = "the lifecycle transition deactivate from the state active failed in the node"
+    assert commands == [SettleLifecycle(N, "inactive", reason)]
+
+
+def test_a_node_that_cannot_be_activated_has_failed() -> None:
+    """The restart policy applies: a source on the way back is started again, and activated."""
+    slave = active()
+    slave.step(LifecycleOrdered(N, "active"))
+    read(slave, "inactive")
+    commands = answered(slave, "activate", succeeded=False)
+    reason = "the lifecycle transition activate from the state inactive failed in the node"
+    assert answers(commands) == [("active", reason)]
+    assert fault(commands) == f"not active: {reason}"
+
+
+def test_an_order_is_refused_if_the_slave_does_not_manage_the_node() -> None:
+    """The same holds for an instance that is unknown or has ended."""
+    slave = Slave()
+    slave.assign(spec("unmanaged"))
+    assert answers(slave.step(LifecycleOrdered(N, "active")))[0][1]
+    assert answers(slave.step(LifecycleOrdered(InstanceId("x", 1), "active")))[0][1]
+
+
+def test_an_order_to_an_instance_that_ends_is_refused() -> None:
+    """Otherwise the answer would never be sent."""
+    slave = active()
+    slave.step(LifecycleOrdered(N, "inactive"))
+    slave.status(InstanceState.EXITED, "n")
+    assert answers(slave.step(TimePassed())) == [("inactive", "it has ended")]
+    assert answers(slave.step(TimePassed())) == []
+
+
+def test_another_goal_replaces_the_former_order() -> None:
+    """On the way back the source is activated although its deactivation is under way."""
+    slave = active()
+    slave.step(LifecycleOrdered(N, "inactive"))
+    read(slave, "active")
+    commands = slave.step(LifecycleOrdered(N, "active"))
+    assert answers(commands) == [("inactive", "another state was ordered")]
+    assert transitions(answered(slave, "deactivate")) == ["activate"]
+    assert answers(answered(slave, "activate")) == [("active", "")]
+
+
+def test_health_is_not_checked_while_an_order_keeps_the_node_inactive() -> None:
+    """An inactive node may be silent."""
+    slave = active(spec(health=Health("scan", 1.0, "active", 2.0)))
+    assert slave.state.watched()
+    slave.step(LifecycleOrdered(N, "inactive"))
+    assert not slave.state.watched()
+    slave.step(LifecycleOrdered(N, "active"))
+    assert slave.state.watched()

@@ -20,6 +20,7 @@ from rosrm.core.master.commands import OrderId, SendOrder
 from rosrm.core.master.events import OrderAnswered, StatusesReceived, UsagesReceived
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.slave import commands, events, reducer
+from rosrm.core.slave.lifecycle_nodes import STATE_AFTER
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.model.devices import Device
@@ -30,6 +31,7 @@ from rosrm.model.orders import (
     ReloadSettings,
     ReplicateSnapshot,
     RunExecutor,
+    SetLifecycleState,
 )
 from rosrm.model.values import (
     EMPTY,
@@ -57,6 +59,7 @@ class Program:
         restart: restart policy that the supervisor applies when the instance ends.
         limits: as last changed while it runs.
         run: number of its restarts; a delayed action for an earlier run has no effect.
+        lifecycle_state: state of its node, if that is a lifecycle node.
     """
 
     assignment: Assignment
@@ -65,6 +68,7 @@ class Program:
     limits: Limits = field(default_factory=Limits)
     state: InstanceState = InstanceState.STARTING
     run: int = 0
+    lifecycle_state: str = "unconfigured"
 
 
 ProgramT = TypeVar("ProgramT", bound=Program)
@@ -133,7 +137,7 @@ class Host(ABC, Generic[ProgramT]):
     batches: int = 0
     newest_pid: int = 100
     limit: FloatArray = field(init=False)
-    _settled: list[commands.Settle] = field(default_factory=list)
+    _settled: list[commands.Settle | commands.SettleLifecycle] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         """Prepare the slave's core and the limits."""
@@ -263,18 +267,30 @@ class Host(ABC, Generic[ProgramT]):
             case commands.Stop(instance):
                 self._stop(instance, now)
             case commands.Fence(instance):
-                if instance in self.programs:
-                    self._end(instance, InstanceState.FENCED, now, signal=_SIGKILL)
+                self._fence(instance, now)
             case commands.Restart(instance):
                 self._restart(instance, now)
             case commands.Amend(instance, amendment):
                 refusal = self._amend(self.programs[instance], amendment)
                 self.tell(events.AmendmentRecorded(instance, amendment, refusal), now)
-            case commands.Settle():
+            case commands.Settle() | commands.SettleLifecycle():
                 self._settled.append(command)
+            case commands.ReadLifecycleState() | commands.ChangeLifecycleState():
+                self.tell(self._answer_of_node(command), now)
             case commands.Forget(instances):
                 for instance in instances:
                     self.ends.pop(instance, None)
+
+    def _answer_of_node(
+        self, request: commands.ReadLifecycleState | commands.ChangeLifecycleState
+    ) -> events.Event:
+        """Return the answer of a lifecycle node, whose transitions succeed."""
+        instance, pid = request.instance, request.pid
+        program = self.programs[instance]
+        if isinstance(request, commands.ReadLifecycleState):
+            return events.LifecycleStateRead(instance, pid, program.lifecycle_state, request.at)
+        program.lifecycle_state = STATE_AFTER[request.transition]
+        return events.TransitionAnswered(instance, pid, request.transition, succeeded=True)
 
     def obey(self, sent: SendOrder, now: float) -> OrderAnswered:
         """Carry out an order, and return the answer."""
@@ -293,6 +309,10 @@ class Host(ABC, Generic[ProgramT]):
                 self.tell(event_of(order), now)
                 (settled,) = self._settled
                 refusal, code = settled.refusal, settled.code
+            case SetLifecycleState():
+                self._settled.clear()
+                self.tell(event_of(order), now)
+                refusal = next((one.refusal for one in self._settled), "the node is not ready")
             case _:
                 self.tell(event_of(order), now)
         return OrderAnswered(sent.order_id, not refusal, code if refusal else "", refusal)
@@ -345,6 +365,7 @@ class Host(ABC, Generic[ProgramT]):
         # With the former pid, the slave would report a node as ready before it is in the graph.
         program.pid = self.next_pid()
         program.run += 1
+        program.lifecycle_state = "unconfigured"
         self.run_begins_again(program, now)
         status = InstanceStatus(instance, InstanceState.STOPPING, restarts=program.run)
         self._supervisor_says(status, now)
@@ -359,6 +380,10 @@ class Host(ABC, Generic[ProgramT]):
         status = InstanceStatus(instance, InstanceState.STOPPING, pid=program.pid)
         self._supervisor_says(status, now)
         self.later(self.stop_time, now, partial(self._stopped, instance))
+
+    def _fence(self, instance: InstanceId, now: float) -> None:
+        if instance in self.programs:
+            self._end(instance, InstanceState.FENCED, now, signal=_SIGKILL)
 
     def _stopped(self, instance: InstanceId, now: float) -> None:
         if instance in self.programs:

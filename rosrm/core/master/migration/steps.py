@@ -20,7 +20,15 @@ from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.pending_orders import MigrationStep
 from rosrm.core.master.state.process import Instance
-from rosrm.model.orders import AmendInstance, Order, RunExecutor, StartInstance, StopInstance
+from rosrm.model.lifecycle_rules import own_services
+from rosrm.model.orders import (
+    AmendInstance,
+    Order,
+    RunExecutor,
+    SetLifecycleState,
+    StartInstance,
+    StopInstance,
+)
 from rosrm.model.plan import (
     Aim,
     AwaitReady,
@@ -28,6 +36,7 @@ from rosrm.model.plan import (
     Commit,
     Configure,
     Execute,
+    SetLifecycle,
     SetRestart,
     Start,
     Step,
@@ -41,6 +50,7 @@ _TITLES: Final[Mapping[type[Step], str]] = {
     AwaitReady: "waiting until {0.instance} is ready on {0.host}",
     AwaitReleased: "waiting until {0.instance} on {0.host} has delivered its last messages",
     Stop: "stopping {0.instance} on {0.host}",
+    SetLifecycle: "bringing {0.instance} on {0.host} to the lifecycle state {0.state}",
     Execute: "the step {0.executor!r} of the migration strategy on {0.host}",
 }
 #: Conditions of a host that does not answer, and may never answer again.
@@ -136,11 +146,14 @@ def _give_order(state: MasterState, migration: Migration, step: Step, now: float
 
 
 def _order_of(
-    state: MasterState, migration: Migration, step: Start | Stop | Execute | SetRestart, now: float
-) -> Order:
+    state: MasterState, migration: Migration,
+    step: Start | Stop | Execute | SetRestart | SetLifecycle, now: float,
+) -> Order:  # fmt: skip
     """Return the order of a step, and note its effects in the migration."""
     if isinstance(step, Stop):
         return StopInstance(step.instance)
+    if isinstance(step, SetLifecycle):
+        return SetLifecycleState(step.instance, step.state)
     if isinstance(step, Execute):
         return RunExecutor(step.executor, _arguments(migration, step), step.timeout)
     if isinstance(step, SetRestart):
@@ -173,10 +186,14 @@ def _start(state: MasterState, migration: Migration, step: Start, now: float) ->
     if instance is not None and instance.node_name != step.node_name:
         instance.node_name = step.node_name
         state.save(process)
-    remapped = replace(spec, remappings={**spec.remappings, **step.remappings})
+    remappings = {**spec.remappings, **step.remappings}
+    if step.instance == migration.destination:
+        remappings |= own_services(spec, step.instance)
+    remapped = replace(spec, remappings=remappings)
     assignment = state.assignment(
-        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored
-    )
+        step.instance, remapped, step.node_name, shadow=step.shadow, restored=step.restored,
+        inactive=step.inactive,
+    )  # fmt: skip
     return StartInstance(assignment)
 
 
@@ -189,7 +206,8 @@ def _in_the_way(state: MasterState, migration: Migration, step: Start, now: floa
     process = state.processes[migration.process]
     back = migration.undo is not None
     aliased = step.node_name not in ("", process.spec.node)
-    if not back and (migration.plan.overlap > 0.0 or aliased or step.restored):
+    beside = migration.plan.overlap > 0.0 or aliased or step.restored or step.inactive
+    if not back and beside:
         return False
     others = [one for one in state.instances_of(process) if one.id != step.instance]
     for other in others:
@@ -243,8 +261,8 @@ def _outcome(state: MasterState, migration: Migration, step: Step, now: float) -
             return done_if(step.instance.number not in state.instances)
         case Configure():
             return handoff.outcome(state, migration, step)
-        case SetRestart():
-            return _of_restart_policy(state, migration, step)
+        case SetRestart() | SetLifecycle():
+            return _of_setting(state, migration, step)
         case Commit():
             return StepProgress.DONE
         case Execute():
@@ -273,7 +291,7 @@ def _of_wait(state: MasterState, migration: Migration, step: AwaitReady, now: fl
     )
 
 
-def _ended(migration: Migration, step: Start | AwaitReady) -> StepFailed:
+def _ended(migration: Migration, step: Start | AwaitReady | SetLifecycle) -> StepFailed:
     how = migration.how_ended(step.instance)
     return StepFailed(f"{step.instance} ended on {step.host}: {how}")
 
@@ -293,14 +311,23 @@ def _ended_before_commit(migration: Migration, instance: Instance) -> StepFailed
     return StepFailed(f"{instance.id} ended on {instance.host.name}: {why}")
 
 
-def _of_restart_policy(state: MasterState, migration: Migration, step: SetRestart) -> StepOutcome:
-    if step.instance.number not in state.instances:
-        return StepProgress.DONE  # an ended instance has no restarts
+def _of_setting(
+    state: MasterState, migration: Migration, step: SetRestart | SetLifecycle
+) -> StepOutcome:
+    instance = state.instances.get(step.instance.number)
+    if instance is None:
+        may_stop = migration.undo is None and not migration.committed
+        if isinstance(step, SetLifecycle) and may_stop:
+            return _ended(migration, step)
+        return StepProgress.DONE  # an ended instance has no restarts and no state
+    failed = _ended_before_commit(migration, instance)
+    if isinstance(step, SetLifecycle) and failed is not None:
+        return failed
     answer = migration.answer
     if answer is None or answer.accepted:
         return done_if(answer is not None)
-    what = f"the restart policy of {step.instance}"
-    return StepFailed(f"{step.host} did not change {what}: {answer.reason}")
+    what = "restart policy" if isinstance(step, SetRestart) else "lifecycle state"
+    return StepFailed(f"{step.host} did not change the {what} of {step.instance}: {answer.reason}")
 
 
 def _of_executor(state: MasterState, migration: Migration, step: Execute) -> StepOutcome:
