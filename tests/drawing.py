@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from rosrm.model.arrays import NO_ARRAY
 from rosrm.model.artifacts import Artifact
+from rosrm.model.component_rules import components_fault
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.durations import LONGEST
 from rosrm.model.lifecycle_rules import lifecycle_fault
@@ -196,7 +197,9 @@ def _accepted(spec: ProcessSpec, program: dict[str, Any]) -> ProcessSpec:
     """Return a spec with one program, and without contradictions."""
     fields_ = {**_NO_PROGRAM, **program, **_scheduling(spec), **_for_jobs(spec)}
     spec = replace(spec, **fields_)
-    return replace(spec, lifecycle=LifecyclePolicy()) if lifecycle_fault(spec) else spec
+    if lifecycle_fault(spec):
+        spec = replace(spec, lifecycle=LifecyclePolicy())
+    return replace(spec, components=()) if components_fault(spec) else spec
 
 
 #: Specs with one program, as a master accepts them.

@@ -29,6 +29,7 @@ from rosrm.model.schedules import SHORTEST, Schedule
 from rosrm.model.values import (
     EMPTY,
     Autostart,
+    Component,
     Container,
     Enforcement,
     GroupMembership,
@@ -148,6 +149,19 @@ class HealthInFile:
 
 
 @dataclass(frozen=True, slots=True)
+class ComponentInFile:
+    """A node that a component container loads into its process."""
+
+    plugin: str
+    name: str
+    package: str = ""
+    namespace: str = ""
+    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+
+@dataclass(frozen=True, slots=True)
 class LifecycleInFile:
     """State to which a host brings a lifecycle node."""
 
@@ -242,6 +256,7 @@ class ProcessInFile:
         "standby": ("true", "{apart_by: [rack]}"),
         "health": ("{topic: scan, rate: 10}", "{lifecycle: active}"),
         "lifecycle": ("active", "{autostart: inactive, timeout: 10s}"),
+        "components": ("[{plugin: my_robot::Detector, name: detector, package: my_robot}]",),
         "near": ("camera", "{processes: [camera], by: rack}"),
         "apart": ("camera", "{processes: [camera], by: rack}"),
         "spread": ("rack", "{}"),
@@ -289,6 +304,7 @@ class ProcessInFile:
     standby: StandbyInFile = field(default_factory=lambda: StandbyInFile(wanted=False))
     health: HealthInFile | None = None
     lifecycle: LifecycleInFile | None = None
+    components: tuple[ComponentInFile, ...] = ()
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
@@ -345,6 +361,10 @@ class ProcessInFile:
             lifecycle=_LIFECYCLE
             if self.lifecycle is None
             else _same(LifecyclePolicy, self.lifecycle),
+            components=tuple(
+                _same(Component, one, parameters=dict(flattened(one.parameters)))
+                for one in self.components
+            ),
             neighbours=tuple(self._neighbour_rules()),
             reschedule=_same(ReschedulePolicy, self.reschedule),
             limits=_same(Limits, self.limits),

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from rosrm.model.arrays import INDEX_PLACEHOLDER
 from rosrm.model.artifacts import artifacts_fault
+from rosrm.model.component_rules import components_fault
 from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import (
     is_namespace,
@@ -208,6 +209,12 @@ def _about_lifecycle(spec: ProcessSpec) -> Iterator[Complaint]:
         yield Complaint(("lifecycle",), fault)
 
 
+def _about_components(spec: ProcessSpec) -> Iterator[Complaint]:
+    fault = components_fault(spec)
+    if fault:
+        yield Complaint(("components",), fault)
+
+
 def _about_program(spec: ProcessSpec) -> Iterator[Complaint]:
     programs = {
         "package + executable": spec.package or spec.executable,
@@ -318,6 +325,7 @@ _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_faults, ("standby", "migration", "kind", "isolation", "host_loss")),
     (_about_health, ("health", "ros", "node_name", *_PROGRAM)),
     (_about_lifecycle, ("lifecycle", "ros", "node_name", "readiness", *_PROGRAM)),
+    (_about_components, ("components", "ros", "node_name", "readiness", "lifecycle", *_PROGRAM)),
     (_about_neighbours, ("name", "near", "apart", "spread")),
     (_about_start_order, ("name", "after")),
     (_about_devices, ("devices",)),

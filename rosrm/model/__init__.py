@@ -23,6 +23,7 @@ schedules.py            times at which a job starts again
 job_checks.py           rules for arrays and schedules
 limits.py               rules for limits and scheduling of a process
 container_rules.py      rules for the container of a process
+component_rules.py      rules for the components that a slave loads into a container
 lifecycle_rules.py      rules for processes whose slave changes their lifecycle state
 secret_rules.py         rules for the secrets of a process
 dependencies.py         rules on processes that start after each other

@@ -356,6 +356,34 @@ class ParameterSource:
 
 
 @dataclass(frozen=True, slots=True)
+class Component:
+    """A node that a component container loads into its process.
+
+    Attributes:
+        plugin: name of the component in its package.
+        name: of its node.
+        package: package that has the component; "": the plugin says it alone.
+        namespace: namespace of the node; "" or absolute.
+        parameters: ROS parameters by dotted names, values as in JSON.
+        remappings: ROS name to ROS name.
+        arguments: extra arguments for the container, values as in JSON.
+    """
+
+    plugin: str
+    name: str
+    package: str = ""
+    namespace: str = ""
+    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+    remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
+
+    @property
+    def full_name(self) -> str:
+        """Return the name of its node with the namespace."""
+        return qualified_name(self.namespace, self.name)
+
+
+@dataclass(frozen=True, slots=True)
 class ProcessSpec:
     """One process to run, in the terms of ROS 2 launch.
 
@@ -428,6 +456,7 @@ class ProcessSpec:
     standby: StandbyPolicy = StandbyPolicy()
     health: Health = Health()
     lifecycle: LifecyclePolicy = LifecyclePolicy()
+    components: tuple[Component, ...] = ()
     neighbours: tuple[NeighbourRule, ...] = ()
     talks_to: Mapping[str, float] = field(default_factory=lambda: EMPTY)
     reschedule: ReschedulePolicy = ReschedulePolicy()

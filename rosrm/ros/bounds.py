@@ -59,6 +59,7 @@ _OTHER_ENTRIES: Final = {
     "ProcessSpec.secrets": 256,
     "ProcessSpec.cpus": 1024,
     "ProcessSpec.parameter_sources": 256,
+    "ProcessSpec.components": 256,
     "HostDescription.unenforced": 16,
     "HostDescription.cpus": 4096,
     "ProcessStatus.enforced": 16,

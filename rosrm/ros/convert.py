@@ -15,6 +15,7 @@ from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
 from rosrm.model.applications import OnFailure, RolloutPolicy, Target
 from rosrm.model.artifacts import Artifact, artifacts_fault, contents_fault
+from rosrm.model.component_rules import components_fault
 from rosrm.model.container_rules import container_fault
 from rosrm.model.description_checks import (
     description_fault,
@@ -171,6 +172,13 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
     return _to_msg(
         msg.ProcessSpec, spec,
         parameters=_json_pairs(spec.parameters),
+        components=[
+            _to_msg(
+                msg.Component, one, parameters=_json_pairs(one.parameters),
+                arguments=_json_pairs(one.arguments),
+            )
+            for one in spec.components
+        ],
         parameter_sources=[
             msg.ParameterSource(
                 file=one.file, nodes=one.nodes, parameters=_json_pairs(one.parameters)
@@ -198,6 +206,13 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     spec = _from_msg(
         values.ProcessSpec, message,
         parameters=_parameters(message),
+        components=tuple(
+            _from_msg(
+                values.Component, one, parameters=_json_values(one.parameters),
+                arguments=_json_values(one.arguments),
+            )
+            for one in message.components
+        ),
         parameter_sources=tuple(
             values.ParameterSource(one.file, one.nodes, _parameters(one))
             for one in message.parameter_sources
@@ -210,7 +225,14 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         talks_to={flow.process: flow.rate for flow in message.talks_to},
         artifacts=_artifacts(message),
     )  # fmt: skip
-    checks = (limits_fault, job_fault, secrets_fault, container_fault, lifecycle_fault)
+    checks = (
+        limits_fault,
+        job_fault,
+        secrets_fault,
+        container_fault,
+        lifecycle_fault,
+        components_fault,
+    )
     fault = next(filter(None, (check(spec) for check in checks)), "")
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
@@ -222,9 +244,11 @@ def _json_pairs(parameters: Mapping[str, Any]) -> list[msg.KeyValue]:
 
 
 def _parameters(message: msg.ProcessSpec | msg.ParameterSource) -> dict[str, Any]:
-    return {
-        pair.key: _json_value(pair.value, f"parameter {pair.key}") for pair in message.parameters
-    }
+    return _json_values(message.parameters)
+
+
+def _json_values(pairs: Iterable[msg.KeyValue]) -> dict[str, Any]:
+    return {pair.key: _json_value(pair.value, f"parameter {pair.key}") for pair in pairs}
 
 
 def target_to_msg(

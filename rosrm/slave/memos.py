@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import json
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 from rosrm.core.slave.watches import Memo
-from rosrm.model.codec import from_plain
+from rosrm.model.codec import from_plain, to_plain
 
 
 def to_memo(memo: Memo) -> str:
-    """Return a memo as text, its parts as lists of their fields; "" if it is empty."""
+    """Return a memo as text, most parts as lists of their fields; "" if it is empty."""
     if memo == Memo():
         return ""
-    awaited, watch, devices, artifacts, lifecycle = astuple(memo)
+    awaited, watch, devices, artifacts, lifecycle, _ = astuple(replace(memo, loads=None))
+    loads = to_plain(memo.loads)
     plain = {"awaited": awaited, "watch": watch}
-    given = {"devices": devices, "artifacts": artifacts, "lifecycle": lifecycle}
+    given = {"devices": devices, "artifacts": artifacts, "lifecycle": lifecycle, "loads": loads}
     return json.dumps({**plain, **{name: value for name, value in given.items() if value}})
 
 

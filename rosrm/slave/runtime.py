@@ -44,9 +44,11 @@ from rosrm.ros.names import token
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.slave.artifacts import ArtifactEndpoint
+from rosrm.ros.slave.component_loads import ComponentLoads
 from rosrm.ros.slave.endpoint import MasterLink, SlaveEndpoint
 from rosrm.ros.slave.flows import FlowSampler
 from rosrm.ros.slave.graph import GraphWatch
+from rosrm.ros.slave.instance_clients import InstanceClients
 from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
@@ -154,7 +156,9 @@ class SlaveRuntime:
             self._open_supervisor(opened)
             graph = self._join_ros(opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
-            self._lifecycle_clients = LifecycleClients(self._participant, self._take)
+            self._clients = InstanceClients(self._participant)
+            self._lifecycle_clients = LifecycleClients(self._clients, self._take)
+            self._component_loads = ComponentLoads(self._clients, self._take)
             self._note_probes(first)
             self._note_broken(offered.broken)
             name = f"{self._participant.node.get_name()}_flows"
@@ -342,7 +346,7 @@ class SlaveRuntime:
                 self._cycle(now)
             if now >= next_usage:
                 next_usage = now + _USAGE_PERIOD
-                self._lifecycle_clients.expire(now)
+                self._clients.expire(now)
                 guard.call(self._usage.look, now, self._sampler.by_process)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
@@ -516,6 +520,8 @@ class SlaveRuntime:
                 settled(command.refusal, command.code)
         elif isinstance(command, commands.ReadLifecycleState | commands.ChangeLifecycleState):
             self._participant.guard.call(self._lifecycle_clients.send, command, time.monotonic())
+        elif isinstance(command, commands.ListComponents | commands.LoadComponent):
+            self._participant.guard.call(self._component_loads.send, command, time.monotonic())
         else:
             self._have_supervisor(command)
 
@@ -533,7 +539,7 @@ class SlaveRuntime:
         self._usage.follow(status)
         if status.state.ended:
             self._starter.ended(status.instance)
-            self._lifecycle_clients.close(status.instance)
+            self._clients.close(status.instance)
 
     # --- requests of the master, and of readers of logs ----------------------------------
 

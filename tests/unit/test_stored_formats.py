@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.core.slave.watches import Awaited, ManagedLifecycle, Memo, Watch
+from rosrm.core.slave.watches import Awaited, LoadedComponents, ManagedLifecycle, Memo, Watch
 from rosrm.model.plan import ReportPhase
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
+    Component,
     Health,
     HostDescription,
     InstanceId,
@@ -48,6 +49,14 @@ MEMOS = [
     (
         Memo(lifecycle=ManagedLifecycle("active", "/n/get", "/n/set", 30.0)),
         '{"awaited": null, "watch": null, "lifecycle": ["active", "/n/get", "/n/set", 30.0]}',
+    ),
+    (
+        Memo(loads=LoadedComponents("/c", (Component("m:C", "n"),))),
+        (
+            '{"awaited": null, "watch": null, "loads": {"services": "/c", "components": [{"plugin":'
+            ' "m:C", "name": "n", "package": "", "namespace": "", "parameters": {}, "remappings": '
+            '{}, "arguments": {}}]}}'
+        ),
     ),
     (
         Memo(watch=Watch(Health())),

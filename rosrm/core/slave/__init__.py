@@ -6,6 +6,8 @@ orders.py        orders of the master as events
 handlers.py      one handler for each event
 state.py         the instances on this host
 watches.py       readiness and health checks; health.py evaluates the checks
+components.py    components of containers
 lifecycle_nodes.py  transitions of lifecycle nodes
+steps.py         results of an event for both
 fencing.py, master_clock.py
 """

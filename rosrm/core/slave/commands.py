@@ -9,6 +9,7 @@ from rosrm.model.orders import NOT_AMENDED
 from rosrm.model.values import (
     Amendment,
     Assignment,
+    Component,
     InstanceId,
     InstanceStatus,
     LifecycleGoal,
@@ -140,6 +141,33 @@ class SettleLifecycle:
 
 
 @dataclass(frozen=True, slots=True)
+class ListComponents:
+    """Request the list of a container's components; `ComponentsListed` follows if it answers.
+
+    Attributes:
+        pid: pid of the run.
+    """
+
+    instance: InstanceId
+    pid: int
+    services: str
+
+
+@dataclass(frozen=True, slots=True)
+class LoadComponent:
+    """Order a container to load a component; `ComponentLoaded` follows.
+
+    Attributes:
+        pid: pid of the run.
+    """
+
+    instance: InstanceId
+    pid: int
+    services: str
+    component: Component
+
+
+@dataclass(frozen=True, slots=True)
 class Remember:
     """Order the supervisor to store facts for a later run of this slave."""
 
@@ -164,5 +192,6 @@ class Report:
 
 Command = (
     Launch | Stop | Fence | Renew | Restart | Fail | Amend | Settle | ReadLifecycleState
-    | ChangeLifecycleState | SettleLifecycle | Remember | Forget | Report
+    | ChangeLifecycleState | SettleLifecycle | ListComponents | LoadComponent | Remember | Forget
+    | Report
 )  # fmt: skip

@@ -9,6 +9,7 @@ from rosrm.core.slave.watches import Memo, Observation, Transition
 from rosrm.model.values import (
     Amendment,
     Assignment,
+    Component,
     InstanceId,
     InstanceStatus,
     LifecycleGoal,
@@ -185,6 +186,35 @@ class TransitionAnswered:
 
 
 @dataclass(frozen=True, slots=True)
+class ComponentsListed:
+    """A container listed its components.
+
+    Attributes:
+        pid: pid of the run that was asked.
+        names: names of their nodes, with the namespaces.
+    """
+
+    instance: InstanceId
+    pid: int
+    names: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentLoaded:
+    """A container has loaded a component, or cannot.
+
+    Attributes:
+        pid: pid of the run.
+        fault: why it is not loaded; "": it is.
+    """
+
+    instance: InstanceId
+    pid: int
+    component: Component
+    fault: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class LookedAt:
     """A watched instance was observed.
 
@@ -232,6 +262,8 @@ Event = (
     | LifecycleOrdered
     | LifecycleStateRead
     | TransitionAnswered
+    | ComponentsListed
+    | ComponentLoaded
     | LookedAt
     | DevicesMissed
     | TimePassed

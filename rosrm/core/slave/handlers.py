@@ -7,9 +7,10 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Final
 
-from rosrm.core.slave import commands, events, fencing, lifecycle_nodes
+from rosrm.core.slave import commands, components, events, fencing, lifecycle_nodes
 from rosrm.core.slave.health import InstanceHealth, watch_of
 from rosrm.core.slave.state import HeldInstance, SlaveState
+from rosrm.core.slave.steps import Step
 from rosrm.core.slave.watches import Awaited, Memo
 from rosrm.model.devices import title_of
 from rosrm.model.values import (
@@ -100,6 +101,7 @@ def _waiting(assignment: Assignment) -> HeldInstance:
     return HeldInstance(
         status, spec, awaited, watch=watch, fenced=fenced, devices=assignment.devices,
         artifacts=spec.artifacts, lifecycle=lifecycle_nodes.managed(assignment),
+        loads=components.loads_of(assignment),
     )  # fmt: skip
 
 
@@ -303,12 +305,13 @@ def _follow(
         known = memo or Memo()
         held = state.held[reported.instance] = HeldInstance(
             reported, awaited=known.awaited, watch=known.watch, devices=known.devices,
-            artifacts=known.artifacts, lifecycle=known.lifecycle,
+            artifacts=known.artifacts, lifecycle=known.lifecycle, loads=known.loads,
         )  # fmt: skip
         if reported.state is InstanceState.RUNNING:
             held.status = _running(held, reported, now)
     elif reported.state is InstanceState.RUNNING:
-        arrived = held.status.state is InstanceState.READY or held.steering is not None
+        ready = held.status.state is InstanceState.READY
+        arrived = ready or held.steering is not None or held.loading is not None
         if arrived and held.status.pid == reported.pid:
             if held.status.enforced == reported.enforced:
                 return None
@@ -316,7 +319,7 @@ def _follow(
         else:
             held.status = _running(held, reported, now)
     else:
-        held.ready_by = held.steering = None
+        held.ready_by = held.steering = held.loading = None
         held.status = _with_unready(held, reported)
     if held.status.state.ended:
         held.ended_at = now
@@ -326,7 +329,7 @@ def _follow(
 
 def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:
     """Return the status of a new run: ready at once, or after its node appears in the graph."""
-    held.steering = None
+    held.steering = held.loading = None
     if held.awaited is None or held.awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
     held.ready_by = now + held.awaited.timeout
@@ -341,8 +344,10 @@ def _with_unready(held: HeldInstance, reported: InstanceStatus) -> InstanceStatu
 
 def _seen(state: SlaveState, event: events.SeenInGraph, now: float) -> _Commands:
     held = state.held.get(event.instance)
-    if held is None or held.ready_by is None or held.awaited is None:
+    if held is None or held.ready_by is None or held.awaited is None or held.loading is not None:
         return []
+    if held.loads is not None:  # until the same deadline
+        return list(components.begin(held, held.loads, now).commands)
     held.ready_by = None
     if held.lifecycle is not None:
         return list(lifecycle_nodes.begin(held, held.lifecycle, now).commands)
@@ -374,15 +379,27 @@ def _transition_answered(
     return _after(state, held, lifecycle_nodes.transition_answered(held, event, now), now)
 
 
-def _after(
-    state: SlaveState, held: HeldInstance, step: lifecycle_nodes.Step, now: float
-) -> _Commands:
-    """Return the commands that follow from a step of a lifecycle node to its goal."""
+def _components_listed(state: SlaveState, event: events.ComponentsListed, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.status.pid != event.pid:
+        return []
+    return _after(state, held, components.listed(held, event), now)
+
+
+def _component_loaded(state: SlaveState, event: events.ComponentLoaded, now: float) -> _Commands:
+    held = state.held.get(event.instance)
+    if held is None or held.status.pid != event.pid:
+        return []
+    return _after(state, held, components.loaded(held, event, now), now)
+
+
+def _after(state: SlaveState, held: HeldInstance, step: Step, now: float) -> _Commands:
+    """Return the commands that follow from a step of an instance on the way to readiness."""
     if step.commands:
         return list(step.commands)
     if not step.reached and not step.fault:
         return []
-    held.steering = None
+    held.ready_by = held.steering = held.loading = None
     answers = lifecycle_nodes.settled(held, step.fault)
     status, lifecycle = held.status, held.lifecycle
     ready = status.state is InstanceState.READY
@@ -443,11 +460,12 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
         if held.ready_by is not None and now >= held.ready_by and awaited is not None:
             held.ready_by = None
             node = " ".join(filter(None, ("no node", awaited.node_name)))
-            held.unready = (
-                f"not ready within {awaited.timeout:g} s: {node} of this instance was seen in the "
-                f"ROS graph"
-            )
+            unseen = f"{node} of this instance was seen in the ROS graph"
+            why = components.lateness(held) or unseen
+            held.unready = f"not ready within {awaited.timeout:g} s: {why}"
             orders.append(commands.Stop(instance))
+        elif held.loading is not None:
+            orders += _after(state, held, components.time_passed(held, now), now)
         elif held.steering is not None:
             orders += _after(state, held, lifecycle_nodes.time_passed(held, now), now)
         elif held.ordered is not None and held.status.state.ended:
@@ -485,6 +503,8 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.LifecycleOrdered: _lifecycle_ordered,
         events.LifecycleStateRead: _state_read,
         events.TransitionAnswered: _transition_answered,
+        events.ComponentsListed: _components_listed,
+        events.ComponentLoaded: _component_loaded,
         events.LookedAt: _looked_at,
         events.DevicesMissed: _devices_missed,
         events.TimePassed: _time_passed,

@@ -8,13 +8,14 @@ configured, or that has activated itself, is not configured again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Final
 
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.health import resolve
 from rosrm.core.slave.state import HeldInstance, Steering
+from rosrm.core.slave.steps import NOTHING, Step
 from rosrm.core.slave.watches import ManagedLifecycle, Transition
 from rosrm.model.values import Assignment, InstanceState, LifecycleGoal
 
@@ -36,24 +37,6 @@ STATE_AFTER: Final[Mapping[Transition, str]] = MappingProxyType(
 #: State that no transition leaves.
 _FINAL: Final = "finalized"
 _SCHEME: Final = "rosservice://"
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """Result of an event for a node on the way to its goal.
-
-    Attributes:
-        commands: requests to the node.
-        reached: the node has reached its goal.
-        fault: why the node cannot reach its goal; "": it can.
-    """
-
-    commands: tuple[commands.Command, ...] = ()
-    reached: bool = False
-    fault: str = ""
-
-
-_NOTHING: Final = Step()
 
 
 def managed(assignment: Assignment) -> ManagedLifecycle | None:
@@ -116,10 +99,10 @@ def state_read(held: HeldInstance, event: events.LifecycleStateRead, now: float)
     """Take the state that a node reports; the answer to a transition may be lost."""
     steering, lifecycle = held.steering, held.lifecycle
     if steering is None or lifecycle is None or event.asked_at < steering.began:
-        return _NOTHING
+        return NOTHING
     steering.state = event.state
     if steering.transition and event.state not in (STATE_AFTER[steering.transition], _FINAL):
-        return _NOTHING
+        return NOTHING
     return _arrived(held, steering, lifecycle, now)
 
 
@@ -127,7 +110,7 @@ def transition_answered(held: HeldInstance, event: events.TransitionAnswered, no
     """Take the answer to a transition."""
     steering, lifecycle = held.steering, held.lifecycle
     if steering is None or lifecycle is None or steering.transition != event.transition:
-        return _NOTHING
+        return NOTHING
     if not event.succeeded:
         where = f" from the state {steering.state}" if steering.state else ""
         return _fault(f"the lifecycle transition {event.transition}{where} failed in the node")
@@ -139,11 +122,11 @@ def time_passed(held: HeldInstance, now: float) -> Step:
     """Request the state of a node again, or give up at the time-out."""
     steering, lifecycle = held.steering, held.lifecycle
     if steering is None or lifecycle is None:
-        return _NOTHING
+        return NOTHING
     if now >= steering.deadline:
         return _fault(_time_out(steering, lifecycle))
     if now - steering.read_at < READ_PERIOD:
-        return _NOTHING
+        return NOTHING
     steering.read_at = now
     return _read(held, lifecycle, now)
 
@@ -159,7 +142,7 @@ def _arrived(
         return _fault(f"its lifecycle state is {_FINAL}; {lifecycle.goal} is required")
     transition = _NEXT.get((steering.state, lifecycle.goal))
     if transition is None:  # the node is in a transition that it began itself
-        return _NOTHING
+        return NOTHING
     steering.transition, steering.deadline = transition, now + lifecycle.timeout
     status = held.status
     change = commands.ChangeLifecycleState(status.instance, status.pid, lifecycle, transition)

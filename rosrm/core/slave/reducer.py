@@ -27,6 +27,8 @@ LifecycleOrdered        changes the goal of a lifecycle node, and reads its stat
                         node has reached the goal
 LifecycleStateRead      requests the next transition; at the goal, marks the instance as ready
 TransitionAnswered      the same; ends the instance as failed if the transition failed
+ComponentsListed        loads the next component that the container lacks; without one it is ready
+ComponentLoaded         requests the list again; ends the container as failed if the load failed
 LookedAt                ends an instance as failed if it has been unhealthy for too long
 DevicesMissed           ends each running instance as failed that holds a missing device
 TimePassed              stops an instance that is not ready in time, ends one as failed whose

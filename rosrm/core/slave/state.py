@@ -11,13 +11,21 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.slave.health import InstanceHealth
-from rosrm.core.slave.watches import Awaited, ManagedLifecycle, Memo, Transition, Watch
+from rosrm.core.slave.watches import (
+    Awaited,
+    LoadedComponents,
+    ManagedLifecycle,
+    Memo,
+    Transition,
+    Watch,
+)
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Amendment,
     Assignment,
+    Component,
     InstanceId,
     InstanceState,
     InstanceStatus,
@@ -48,6 +56,21 @@ class Steering:
 
 
 @dataclass(slots=True)
+class Loading:
+    """Work on the components of a container.
+
+    Attributes:
+        asked_at: time of the newest request for the list of its components.
+        answered: components that it has loaded, as it says.
+        current: component that it is loading; None: none.
+    """
+
+    asked_at: float
+    answered: tuple[Component, ...] = ()
+    current: Component | None = None
+
+
+@dataclass(slots=True)
 class HeldInstance:
     """One instance on this host.
 
@@ -66,6 +89,8 @@ class HeldInstance:
         devices: devices that it holds.
         artifacts: artifacts that it uses.
         lifecycle: None: the slave does not change the lifecycle state of its node.
+        loads: None: the slave loads no components into it.
+        loading: None: it is not in the graph, or has all its components.
         steering: None: its node is not in the graph, or has reached its goal.
         ordered: goal of an order of the master that is not answered yet; None: there is none.
     """
@@ -83,13 +108,17 @@ class HeldInstance:
     devices: tuple[HeldDevice, ...] = ()
     artifacts: tuple[Artifact, ...] = ()
     lifecycle: ManagedLifecycle | None = None
+    loads: LoadedComponents | None = None
+    loading: Loading | None = None
     steering: Steering | None = None
     ordered: LifecycleGoal | None = None
 
     @property
     def memo(self) -> Memo:
         """Return the facts that a later run of this slave needs."""
-        return Memo(self.awaited, self.watch, self.devices, self.artifacts, self.lifecycle)
+        return Memo(
+            self.awaited, self.watch, self.devices, self.artifacts, self.lifecycle, self.loads
+        )
 
     @property
     def becomes_ready(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Literal
 
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
-from rosrm.model.values import Health, LifecycleGoal
+from rosrm.model.values import Component, Health, LifecycleGoal
 
 #: Lifecycle transitions that a slave requests.
 Transition = Literal["configure", "activate", "deactivate"]
@@ -89,6 +89,19 @@ class ManagedLifecycle:
 
 
 @dataclass(frozen=True, slots=True)
+class LoadedComponents:
+    """Components that the slave loads into a container after each start and each restart.
+
+    Attributes:
+        services: absolute name in front of the names of the container's services.
+        components: in the order of loading.
+    """
+
+    services: str
+    components: tuple[Component, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Memo:
     """Facts about an instance for a later run of this slave, which does not know its spec.
 
@@ -98,6 +111,7 @@ class Memo:
         devices: devices that the instance holds.
         artifacts: artifacts that the instance uses.
         lifecycle: None: the slave does not change the lifecycle state of the node.
+        loads: None: the slave loads no components into the instance.
     """
 
     awaited: Awaited | None = None
@@ -105,3 +119,4 @@ class Memo:
     devices: tuple[HeldDevice, ...] = ()
     artifacts: tuple[Artifact, ...] = ()
     lifecycle: ManagedLifecycle | None = None
+    loads: LoadedComponents | None = None

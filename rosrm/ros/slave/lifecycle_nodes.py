@@ -6,33 +6,25 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any, Final
 
-from rclpy.qos import qos_profile_services_default
-
 from rosrm.core.slave import events
 from rosrm.core.slave.commands import ChangeLifecycleState, ReadLifecycleState
 from rosrm.model.values import InstanceId
-from rosrm.ros.control import ControlClient
-from rosrm.ros.participant import Participant
+from rosrm.ros.slave.instance_clients import InstanceClients
 
 #: Seconds after which a request for a state counts as lost; the core repeats it.
 _PATIENCE: Final = 1.0
 
 
 class LifecycleClients:
-    """Service clients of the managed lifecycle nodes, created at the first request to each.
-
-    The clients of a node stay until its instance ends, because discovery would delay the first
-    request of a new client.
+    """Requests to the managed lifecycle nodes.
 
     Args:
         take: takes events for the core.
     """
 
-    def __init__(self, participant: Participant, take: Callable[[events.Event], None]) -> None:
-        self._node = participant.node
+    def __init__(self, clients: InstanceClients, take: Callable[[events.Event], None]) -> None:
+        self._clients = clients
         self._take = take
-        self._calls = ControlClient(participant, "")
-        self._clients: dict[InstanceId, dict[str, Any]] = {}
 
     def send(self, request: ReadLifecycleState | ChangeLifecycleState, now: float) -> None:
         """Send a request to a node; its answer becomes an event."""
@@ -40,15 +32,6 @@ class LifecycleClients:
             self._read(request)
         else:
             self._change(request, now)
-
-    def expire(self, now: float) -> None:
-        """Drop requests without an answer."""
-        self._calls.expire(now)
-
-    def close(self, instance: InstanceId) -> None:
-        """Destroy the clients of an instance that has ended."""
-        for client in self._clients.pop(instance, {}).values():
-            self._node.destroy_client(client)
 
     def _read(self, request: ReadLifecycleState) -> None:
         """Ask a node for its state, if discovery has found both services.
@@ -65,7 +48,7 @@ class LifecycleClients:
                 self._take(events.LifecycleStateRead(instance, pid, label, at))
 
         if client.service_is_ready() and changing.service_is_ready():
-            self._calls.call(client, client.srv_type.Request(), at + _PATIENCE, answered)
+            self._clients.call(client, client.srv_type.Request(), at + _PATIENCE, answered)
 
     def _change(self, request: ChangeLifecycleState, now: float) -> None:
         """Ask a node for a transition."""
@@ -81,13 +64,7 @@ class LifecycleClients:
         message.transition.id = getattr(
             import_module("lifecycle_msgs.msg").Transition, f"TRANSITION_{transition.upper()}"
         )
-        self._calls.call(client, message, now + request.lifecycle.timeout, answered)
+        self._clients.call(client, message, now + request.lifecycle.timeout, answered)
 
     def _client(self, instance: InstanceId, kind: str, name: str) -> Any:
-        clients = self._clients.setdefault(instance, {})
-        if kind not in clients:
-            clients[kind] = self._node.create_client(
-                getattr(import_module("lifecycle_msgs.srv"), kind), name,
-                qos_profile=qos_profile_services_default,
-            )  # fmt: skip
-        return clients[kind]
+        return self._clients.get(instance, getattr(import_module("lifecycle_msgs.srv"), kind), name)

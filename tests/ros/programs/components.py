@@ -15,6 +15,7 @@ class Talker(Node):
         super().__init__("talker", **options)
         says = self.declare_parameter("says", "nothing")
         output = self.create_publisher(String, "words", 10)
+        self.get_logger().info(f"{self.get_fully_qualified_name()} says {says.value}")
         self.create_timer(0.05, lambda: output.publish(String(data=says.value)))
 
 

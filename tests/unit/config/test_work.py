@@ -12,6 +12,7 @@ from rosrm.errors import ConfigError
 from rosrm.extensions.contracts import Capabilities, MigrationOffer
 from rosrm.extensions.units import PositiveSeconds
 from rosrm.model.values import (
+    Component,
     Container,
     Kind,
     LifecyclePolicy,
@@ -104,6 +105,11 @@ def test_every_key_is_read(file):
         ("command: x, migration: null", "migration", MigrationPolicy()),
         ("command: x, readiness: running", "readiness", Readiness("running")),
         ("package: p, executable: e, lifecycle: active", "lifecycle", LifecyclePolicy("active")),
+        (
+            "module: e, ros: true, components: [{plugin: q, name: c, parameters: {a: {b: 1}}}]",
+            "components",
+            (Component("q", "c", parameters={"a.b": 1}),),
+        ),
         (
             "package: p, executable: e, lifecycle: {timeout: 5s}",
             "lifecycle",
@@ -257,6 +263,7 @@ BESIDE = {
     "spread": "foreach: {i: [1, 2]}", "at": "kind: job", "on": "kind: job, at: '06:00'",
     "standby": "migration: handoff", "health": "ros: true", "parameters": "ros: true",
     "remappings": "ros: true", "lifecycle": "ros: true",
+    "components": "ros: true",
 }  # fmt: skip
 
 
@@ -490,6 +497,21 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
             "`readiness: running` does not wait for that",
         ),
         ("name: a, module: x, ros: true, lifecycle: on", "autostart"),
+        ("name: a, command: x, components: [{plugin: p, name: c}]", "set `ros: true`"),
+        (
+            "name: a, module: x, ros: true, components: [&c {plugin: p, name: c}, *c]",
+            "/c is there twice",
+        ),
+        ("name: a, module: x, ros: true, components: [{plugin: '', name: c}]", "has no plugin"),
+        ("name: a, module: x, ros: true, components: [{plugin: p, name: c d}]", "'c d' cannot be"),
+        (
+            "name: a, module: x, ros: true, components: [{plugin: p, name: c, namespace: d}]",
+            "is not an absolute namespace",
+        ),
+        (
+            "name: a, module: x, ros: true, lifecycle: active, components: [{plugin: p, name: c}]",
+            "a container has no lifecycle",
+        ),
         ("name: a, command: 'x $(find-pkg-share b)'", "write a list of words"),
         ("name: a, module: x, ros: true, parameters: {b: [1, a]}", "values of one type"),
         ("name: a, module: x, ros: true, parameters: {b: .nan}", "a finite number is required"),

@@ -18,7 +18,7 @@ from rosrm.cli.commands import app
 from rosrm.config.cluster import load_cluster
 from rosrm.config.groups import GroupInFile
 from rosrm.config.host import load_host
-from rosrm.config.process import NeighboursInFile, ProcessInFile
+from rosrm.config.process import ComponentInFile, NeighboursInFile, ProcessInFile
 from rosrm.config.rollout import RolloutInFile
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.config.work import load_work
@@ -112,12 +112,22 @@ def test_every_option_of_a_policy_and_a_strategy_is_documented(heading, options)
 def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted = set(keys(ProcessInFile)) | {"foreach", "processes", "defaults"}
     wanted |= {"restart", "migration", "readiness", "stop"}
-    wanted |= {"host_loss", "isolation", "standby", "health", "lifecycle", "spread", "reschedule"}
+    wanted |= {
+        "host_loss",
+        "isolation",
+        "standby",
+        "health",
+        "lifecycle",
+        "components",
+        "spread",
+        "reschedule",
+    }
     wanted |= {"limits", "realtime", "container", "after.delay", "after.on_restart"}
     wanted |= {"group", *keys(GroupInFile, "group.")}
     wanted |= {"app", "rollout", *keys(RolloutInFile, "rollout.")}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
+    wanted |= set(keys(ComponentInFile, "components."))
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
 
 

@@ -243,6 +243,7 @@ NONSENSE_IN_SPECS = {
     "a delay before another host": lambda m: setattr(m.reschedule, "delay", -1.0),
     "a loss of centuries": lambda m: setattr(m.host_loss, "delay", 1e9),
     "an isolation of centuries": lambda m: setattr(m.isolation, "after", 1e9),
+    "a component of no ROS node": lambda m: m.components.append(msg.Component(name="c")),
     "a lifecycle": lambda m: setattr(m.lifecycle, "autostart", "on"),
     "a lifecycle of no ROS node": lambda m: setattr(m.lifecycle, "autostart", "active"),
     "a transition without end": lambda m: setattr(m.lifecycle, "timeout", INF),

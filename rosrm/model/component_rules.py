@@ -1,0 +1,35 @@
+"""Rules on the components that a slave loads into a container."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+from rosrm.model.description_checks import is_namespace, is_node_name, node_name_fault
+from rosrm.model.values import ProcessSpec
+
+
+def components_fault(spec: ProcessSpec) -> str:
+    """Return why the slave cannot load the components of a process; "" if it can."""
+    return next(_faults(spec), "") if spec.components else ""
+
+
+def _faults(spec: ProcessSpec) -> Iterator[str]:
+    if not spec.ros or not spec.node or not spec.awaits_graph:
+        yield (
+            "components: the slave loads them into a ROS node of a known name that is in the "
+            "graph; set `ros: true`, and neither `node_name: keep` nor `readiness: running`"
+        )
+    if spec.lifecycle.is_managed:
+        yield "components: a container has no lifecycle; leave out `lifecycle`"
+    for one in spec.components:
+        if not one.plugin:
+            yield f"components: {one.name!r:.250} has no plugin, such as my_robot::Detector"
+        if not is_node_name(one.name):
+            yield f"components: {node_name_fault(one.name)}"
+        if one.namespace and not is_namespace(one.namespace):
+            namespace = f"{one.namespace!r:.250}"
+            yield f"components: {namespace} is not an absolute namespace such as '/robot1'"
+    names = Counter(one.full_name for one in spec.components)
+    for name in (name for name, count in names.items() if count > 1):
+        yield f"components: {name} is there twice; give each node a name of its own"

@@ -1,0 +1,55 @@
+"""Components that a real slave loads into a real container."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from rosrm.model.values import Component, ProcessSpec, RestartPolicy
+from tests.ros.clusters import Cluster, host
+
+pytest.importorskip("composition_interfaces")
+
+ROOT = Path(__file__).resolve().parents[2]
+TALKER = "tests.ros.programs.components:Talker"
+BROKEN = "tests.ros.programs.components:Broken"
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared) -> Cluster:
+    return make_shared(host("a"))
+
+
+def container(name: str, *components: Component, **fields) -> ProcessSpec:
+    """Return a container for nodes in Python."""
+    return ProcessSpec(
+        name, module="rosrm.node.container", ros=True, components=components,
+        environment={"PYTHONPATH": str(ROOT)}, **fields,
+    )  # fmt: skip
+
+
+def test_components_are_loaded_after_each_start_and_each_restart(cluster: Cluster) -> None:
+    """The container is running when it has them; names and parameters are those of the spec."""
+    left = Component(TALKER, "talker", namespace="/left", parameters={"says": "hello"})
+    right = Component(TALKER, "talker", namespace="/right")
+    restart = RestartPolicy("on-failure", delay=0.05)
+    cluster.submit(container("pair", left, right, restart=restart))
+    row = cluster.wait("pair", "running")
+    both = "/left/talker says hello", "/right/talker says nothing"
+    assert [one for one in both if one in cluster.log("pair")] == list(both)
+    os.kill(row.pid, signal.SIGKILL)
+    cluster.wait("pair", "running", restarts=1)
+    assert [cluster.log("pair").count(one) for one in both] == [2, 2]
+    cluster.cancel("pair")
+
+
+def test_a_component_that_cannot_be_loaded_fails_its_container(cluster: Cluster) -> None:
+    """The process says which, and what its constructor raised."""
+    good, bad = Component(TALKER, "good"), Component(BROKEN, "bad")
+    cluster.submit(container("half", good, bad, restart=RestartPolicy("never")))
+    reason = cluster.wait("half", "failed").reason
+    assert "the component /bad cannot be loaded: " in reason
+    assert "OSError: no device here" in reason
