@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.model.values import Component, ProcessSpec, RestartPolicy
+from rosrm.model.values import Component, MigrationPolicy, ProcessSpec, RestartPolicy
 from tests.ros.clusters import Cluster, host
 
 pytest.importorskip("composition_interfaces")
@@ -20,7 +20,7 @@ BROKEN = "tests.ros.programs.components:Broken"
 
 @pytest.fixture(scope="module")
 def cluster(make_shared) -> Cluster:
-    return make_shared(host("a"))
+    return make_shared(host("a"), host("b"))
 
 
 def container(name: str, *components: Component, **fields) -> ProcessSpec:
@@ -44,6 +44,19 @@ def test_components_are_loaded_after_each_start_and_each_restart(cluster: Cluste
     cluster.wait("pair", "running", restarts=1)
     assert [cluster.log("pair").count(one) for one in both] == [2, 2]
     cluster.cancel("pair")
+
+
+def test_a_moved_container_has_its_components_again(cluster: Cluster) -> None:
+    """The old one has ended before the new one starts: both would answer a request to load."""
+    talker = Component(TALKER, "talker", parameters={"says": "moved"})
+    cluster.submit(container("mover", talker, migration=MigrationPolicy("relaunch")))
+    source = cluster.wait("mover", "running").host
+    cluster.client.migrate("mover", None)
+    cluster.wait_for_event("migrated", process="mover")
+    row = cluster.wait("mover", "running")
+    assert row.host != source
+    assert "/talker says moved" in cluster.log("mover")
+    cluster.cancel("mover")
 
 
 def test_a_component_that_cannot_be_loaded_fails_its_container(cluster: Cluster) -> None:

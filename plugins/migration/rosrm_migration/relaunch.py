@@ -2,8 +2,8 @@
 
 As in the paper (III-C1) the new instance starts first, and the old one is stopped afterwards. So
 there is no moment without an instance, and a moment with both. ROS 1 ended the older node of the
-same name; ROS 2 only warns, so the plan stops it. A process that declares `overlap: false` is
-stopped first, and started again at its source if the destination fails.
+same name; ROS 2 only warns, so the plan stops it. A process that declares `overlap: false`, or has
+components, is stopped first, and started again at its source if the destination fails.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ class Relaunch:
 
     def propose(self, move: Move) -> Plan:
         """Return the plan: start, await ready, commit, stop the source; or with the stop first."""
-        if move.spec.migration.overlap:
+        # Two containers of one name would both load what their slaves request.
+        containers = move.spec.components or move.destination_spec.components
+        if move.spec.migration.overlap and not containers:
             return _start_first(move, move.options)
         return _stop_first(move, move.options.start_timeout)
 
