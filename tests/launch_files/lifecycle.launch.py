@@ -43,7 +43,27 @@ def generate_launch_description():
             ),
             LifecycleTransition(
                 lifecycle_node_names=["/maps"],
-                transition_ids=[Transition.TRANSITION_CONFIGURE],
+                transition_ids=[
+                    Transition.TRANSITION_CONFIGURE,
+                    Transition.TRANSITION_INACTIVE_SHUTDOWN,
+                ],
+            ),
+            RegisterEventHandler(
+                OnStateTransition(
+                    target_lifecycle_node=driver,
+                    goal_state="active",
+                    entities=[Node(package="demo_robot", executable="talker", name="planner")],
+                )
+            ),
+            RegisterEventHandler(
+                OnStateTransition(
+                    target_lifecycle_node=driver,
+                    goal_state="finalized",
+                    entities=[Node(package="demo_robot", executable="talker", name="never")],
+                )
+            ),
+            LifecycleNode(
+                package="demo_robot", executable="talker", name="waiting", namespace="robot"
             ),
             Node(package="demo_robot", executable="talker", name="plain"),
         ]

@@ -16,12 +16,17 @@ from rosrm_launch.translate import translated
 from tests.launch_files import make_package, stored
 from tests.ros.clusters import NODE, host
 
+#: The node of these files, which is a lifecycle node where a file makes its transitions.
+LIFECYCLE_NODE = NODE.replace(
+    "from rclpy.node import Node", "from rclpy.lifecycle import LifecycleNode as Node"
+)
+
 
 @pytest.fixture(scope="module")
 def package(tmp_path_factory):
     """Return the prefix of the package of the launch files, with a real node in it."""
     prefix = tmp_path_factory.mktemp("install")
-    make_package(prefix, NODE)
+    make_package(prefix, LIFECYCLE_NODE)
     return prefix
 
 
@@ -86,7 +91,7 @@ def test_events_and_timers_of_a_launch_file(cluster) -> None:
     ["sensors.launch.xml", "tools.launch.yaml", "lifecycle.launch.py", "components.launch.xml"],
 )
 def test_the_processes_of_each_other_file_run(cluster, name) -> None:
-    """XML, YAML, unmanaged lifecycle nodes, and containers without their components."""
+    """XML, YAML, lifecycle nodes in the required states, and containers without components."""
     target = target_of(name)
     cluster.client.apply([target])
     for spec in target.specs:

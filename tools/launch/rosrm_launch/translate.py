@@ -21,6 +21,8 @@ _ENDLESS: Final = 2**31 - 1
 #: Most processes that one start order names.
 _MOST_AWAITED: Final = 256
 _NOT_YET: Final = "cannot be translated yet"
+#: Transition of a lifecycle node to the state to which its host brings it.
+_GOALS: Final = {"configure": "inactive", "activate": "active", "autostart": "active"}
 #: Characters that no name of a process has.
 _FOREIGN: Final = re.compile(r"[^A-Za-z0-9_.-]+")
 
@@ -65,6 +67,7 @@ class _Translator:
         self._notes = list(model.notes)
         self._started = self._without_endless_waits(model.processes)
         self._names = dict(zip((one.number for one in self._started), self._chosen(), strict=True))
+        self._lifecycle = self._lifecycle_goals()
         self._jobs = {
             wait.process for one in self._started for wait in one.waits if wait.event == "exited"
         }
@@ -109,7 +112,7 @@ class _Translator:
             yield name
 
     def _note_parts(self) -> None:
-        """List components and transitions, and refuse containers that cannot be told apart."""
+        """List components, and refuse containers that cannot be told apart."""
         model = self._model
         containers = [one for one in model.processes if one.kind == "container"]
         for node, count in Counter(map(_node_of, containers)).items():
@@ -123,9 +126,23 @@ class _Translator:
         for load in model.loads:
             plugins = listed([part.plugin for part in load.components])
             self._omit(load, f"LoadComposableNodes into {load.container}", f"{plugins}: {_NOT_YET}")
-        for change in model.transitions:
-            nodes = listed(change.nodes) or "no node"
-            self._omit(change, f"transition {change.transition} of {nodes}", _NOT_YET)
+
+    def _lifecycle_goals(self) -> dict[str, str]:
+        """Return the state to which the file brings each node; list all other transitions."""
+        known = {_node_of(one) for one in self._started if one.kind in ("lifecycle", "node")}
+        goals: dict[str, str] = {}
+        for change in self._model.transitions:
+            goal = _GOALS.get(change.transition, "")
+            nodes = [f"/{node.strip('/')}" for node in change.nodes]
+            strange = [node for node in nodes if not goal or node not in known]
+            if strange or not nodes:
+                whose = listed(strange) if strange else "no node"
+                title = f"transition {change.transition} of {whose}"
+                why = "the file starts no such node" if goal else "a host makes no such transition"
+                self._omit(change, title, why)
+            for node in set(nodes) - set(strange):
+                goals[node] = "active" if "active" in (goal, goals.get(node)) else goal
+        return goals
 
     def _omit(self, at: Any, action: str, reason: str) -> None:
         self._omissions.append(Omission(file=at.file, action=action, reason=reason))
@@ -152,6 +169,7 @@ class _Translator:
             "remappings": _remappings(one.remappings),
             "environment": self._paths.in_texts(one.environment),
             "working_directory": self._paths.in_texts(one.working_directory),
+            "lifecycle": self._lifecycle.get(_node_of(one), ""),
             "kind": "job" if one.number in self._jobs else "",
             "restart": _restart(one),
             "stop": _stop(one),

@@ -32,9 +32,11 @@ from launch.utilities.type_utils import perform_typed_substitution
 from launch_ros import actions as ros
 from launch_ros.actions.lifecycle_transition import LifecycleTransition
 from launch_ros.actions.ros_timer import ROSTimer
-from launch_ros.events.lifecycle import ChangeState
+from launch_ros.event_handlers import OnStateTransition
+from launch_ros.events.lifecycle import ChangeState, StateTransition
 from launch_ros.substitutions import ExecutableInPackage
 from launch_ros.utilities import make_namespace_absolute, prefix_namespace
+from lifecycle_msgs.msg import State, TransitionEvent
 
 from rosrm.wording import get_close_matches, listed
 from rosrm_launch.model import (
@@ -406,6 +408,11 @@ class _Visitor:
 
     def _handler(self, action: Any) -> None:
         handler = action.event_handler
+        if type(handler) is OnStateTransition and self._comes_up(handler):
+            # A lifecycle node whose host brings it to a state has started when it is there.
+            node = handler._OnStateTransition__target_lifecycle_node
+            self._on_event(handler, handler.entities, "started", node)
+            return
         kinds = ((handlers.OnProcessExit, "exited"), (handlers.OnProcessStart, "started"))
         event = next((word for kind, word in kinds if type(handler) is kind), "")
         if not event:
@@ -418,6 +425,14 @@ class _Visitor:
             self._omit(handler, "it is for processes that only its Python code knows")
             return
         self._on_event(handler, entities or getattr(handler, f"{private}on_event"), event, target)
+
+    def _comes_up(self, handler: Any) -> bool:
+        """Return True for the event that one node was configured or activated."""
+        node = handler._OnStateTransition__target_lifecycle_node
+        return node is not None and any(
+            handler.matches(StateTransition(action=node, msg=_transition(start, goal)))
+            for start, goal in (("configuring", "inactive"), ("activating", "active"))
+        )
 
     def _on_event(self, what: Any, entities: Any, event: str, target: Any) -> None:
         """Defer the actions that follow an event of a process."""
@@ -465,6 +480,13 @@ class _Visitor:
         name = known.removeprefix("TRANSITION_").lower()
         found = Transition(file=self._file, nodes=nodes, transition=name)
         self.record.transitions.append(found)
+
+
+def _transition(start: str, goal: str) -> TransitionEvent:
+    """Return the message that a lifecycle node publishes at the end of a transition."""
+    event = TransitionEvent(start_state=State(label=start), goal_state=State(label=goal))
+    event.transition.label = "transition_success"
+    return event
 
 
 def _unknown(names: Sequence[str], known: Sequence[str]) -> str:

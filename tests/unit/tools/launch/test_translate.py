@@ -10,7 +10,7 @@ from rosrm.config.work import checked_work
 from rosrm.errors import ConfigError
 from rosrm.model.values import GroupMembership, Kind, RestartPolicy, StartOrder, StopPolicy
 from rosrm_launch.beside import completed
-from rosrm_launch.model import LaunchModel, Parameters, Process, Wait
+from rosrm_launch.model import LaunchModel, Parameters, Process, Transition, Wait
 from rosrm_launch.translate import translated
 from tests.launch_files import CASES, stored
 
@@ -92,17 +92,37 @@ def test_events_become_a_start_order_and_a_group():
     assert specs["late"].group == GroupMembership("events", "never")
 
 
+def test_transitions_become_the_state_to_which_a_host_brings_a_node():
+    """A node that the file only configures is inactive; what waits for a state waits for ready."""
+    specs = specs_of("lifecycle.launch.py")
+    found = {name: spec.lifecycle.autostart for name, spec in specs.items()}
+    assert found == {
+        "robot.driver": "active", "maps": "inactive", "robot.waiting": "unmanaged",
+        "plain": "unmanaged", "planner": "unmanaged",
+    }  # fmt: skip
+    assert specs["planner"].start_order == StartOrder({"robot.driver": "ready"})
+
+
+def test_transitions_of_unknown_nodes_are_listed():
+    """Another launch file may start them."""
+    changes = [
+        Transition(file="/x/robot.launch.py", nodes=nodes, transition=name)
+        for nodes, name in ((["/a", "b"], "autostart"), ([], "activate"), (["/a"], "cleanup"))
+    ]
+    made_of_two = made(node(0, "b"), node(1), transitions=changes)
+    assert made_of_two.work["processes"][0]["lifecycle"] == "active"
+    assert [(one.action, one.reason) for one in made_of_two.omissions] == [
+        ("transition autostart of /a", "the file starts no such node"),
+        ("transition activate of no node", "the file starts no such node"),
+        ("transition cleanup of /a", "a host makes no such transition"),
+    ]
+
+
 @pytest.mark.parametrize(
     ("name", "said"),
     [
         ("events.launch.py", ["OnProcessIO", "OnProcessExit", "OnShutdown", "EmitEvent"]),
-        (
-            "lifecycle.launch.py",
-            [
-                "OnStateTransition", "transition configure of /robot/driver",
-                "transition configure of /maps",
-            ],
-        ),
+        ("lifecycle.launch.py", ["OnStateTransition", "transition inactive_shutdown of /maps"]),
         (
             "components.launch.py",
             ["container /camera/pipeline", "LoadComposableNodes into /camera/pipeline"],
@@ -112,7 +132,7 @@ def test_events_become_a_start_order_and_a_group():
     ],
 )  # fmt: skip
 def test_what_has_no_counterpart_is_listed_with_its_file(name, said):
-    """Components and transitions are listed, and their processes run."""
+    """Components and other transitions are listed, and their processes run."""
     omissions = translation_of(name).omissions
     assert [one.action for one in omissions] == said
     assert all(one.file.endswith(f"demo_robot/launch/{name}") for one in omissions)
