@@ -59,7 +59,12 @@ def as_planned(planned: ApplyResult | None, request: Request) -> Request:
         now = request(plan_only=True)
         for text in differences(planned, now):
             echo(f"rosrm: other readings than at the time of the plan: {text}", err=True)
-        return now if plan_only else replace(request(), actions=now.actions)
+        if plan_only:
+            return now
+        done = request()
+        numbers = done.versions
+        actions = [replace(one, version=numbers.get(one.application, 0)) for one in now.actions]
+        return replace(done, actions=tuple(actions))
 
     return checked
 

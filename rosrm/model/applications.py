@@ -77,6 +77,7 @@ class PlannedAction:
         fields: names of the changed fields of the spec.
         waits: why it will wait after the action; "": it will not.
         decision: placement decision, as in the event record; None: nothing is placed.
+        version: number of the requested version; 0: a cancellation, or a plan, which makes none.
     """
 
     process: str
@@ -88,6 +89,7 @@ class PlannedAction:
     fields: tuple[str, ...] = ()
     waits: str = ""
     decision: Mapping[str, Any] | None = None
+    version: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,11 @@ class ApplyResult:
     message: str
     actions: tuple[PlannedAction, ...] = ()
     work: str = ""
+
+    @property
+    def versions(self) -> Mapping[str, int]:
+        """Return the number of the requested version of each application with an action."""
+        return {one.application: one.version for one in self.actions}
 
 
 #: Condition of an application.

@@ -144,12 +144,15 @@ def carry_out(
     limit = longest(timeout)
     with connection.master(ctx, domain) as client:
         result = begin(prepare(client), plan=plan, no_wait=no_wait, as_json=as_json)
+        # The desired version of an application without an action is the requested one.
+        desired = {row.name: row.version for row in client.list_applications()}
+        versions = {**desired, **result.versions}
         with interruptible("the applications change further (`rosrm apps`)"):
             rows = client.wait_for_applications(
                 names, timeout=limit, on_change=applications.show_progress
             )
         print_elsewhere(client, result)
-    shown = [applications.show_end(row) for row in rows]
+    shown = [applications.show_end(row, versions.get(row.name, 0)) for row in rows]
     missing = set(names).difference(row.name for row in rows)
     for name in sorted(missing):
         echo(f"rosrm: {name} is no longer listed", err=True)

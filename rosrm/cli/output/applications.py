@@ -76,14 +76,19 @@ def show_progress(row: ApplicationRow) -> None:
     echo(f"{row.name}{version}: {left} to go: {_pending(row)}", err=True)
 
 
-def show_end(row: ApplicationRow) -> bool:
-    """Print the state of an application; return True if it is as requested."""
+def show_end(row: ApplicationRow, requested: int = 0) -> bool:
+    """Print the state of an application; return True if it is as requested.
+
+    `requested`: number of the requested version; 0: unknown.
+    """
     given_up = row.returned_from
     why = row.reason or _pending(row)
-    if given_up is not None:
-        why = f"version {given_up.number} was given up: {given_up.given_up}"
+    is_done = row.state in ("running", "cancelled")
+    if given_up is not None and requested in (0, given_up.number):
+        is_done, why = False, f"version {given_up.number} was given up: {given_up.given_up}"
+    elif requested not in (0, row.version):
+        is_done, why = False, f"another request has replaced version {requested}"
     version = f" at version {row.version}" if row.version else ""
     text = f"{row.name} is {row.state}{version}" + (f": {why}" if why else "")
-    is_done = given_up is None and row.state in ("running", "cancelled")
     echo(text if is_done else f"rosrm: {text}", err=not is_done)
     return is_done

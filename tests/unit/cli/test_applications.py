@@ -1,4 +1,4 @@
-"""Commands on applications: history and revert."""
+"""Commands on applications: apply, history and revert."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from rosrm.model.applications import ApplicationRow, VersionRow
+from rosrm.model.applications import (
+    Action,
+    ApplicationRow,
+    ApplyResult,
+    PlannedAction,
+    VersionRow,
+)
 
 FIRST = VersionRow(1, 1_700_000_000.0, "user:ada", 2)
 SECOND = VersionRow(2, 1_700_000_010.0, "user:ada", 2, wanted=True)
@@ -14,6 +20,13 @@ PAUSED = ApplicationRow(
     "nav", "user:ada", "paused", 2, 2, 1, reason="p: it does not run well: exit code 1",
     versions=(FIRST, SECOND),
 )  # fmt: skip
+
+
+@pytest.fixture
+def work(tmp_path):
+    path = tmp_path / "nav.yaml"
+    path.write_text("app: nav\nprocesses: [{name: p, command: x}]\n")
+    return path
 
 
 @pytest.mark.parametrize(
@@ -37,3 +50,32 @@ def test_a_revert_without_a_version_to_return_to_says_so(rosrm, client):
     result = rosrm("revert", "nav")
     assert result.code == 2
     assert result.err.startswith("rosrm: nav has no version before 2 that was not given up. `ros")
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        replace(PAUSED, state="running", version=3, reason=""),
+        replace(PAUSED, state="cancelled", version=0, reason=""),
+    ],
+    ids=["applied", "cancelled"],
+)
+def test_an_apply_that_another_request_replaces_says_so(rosrm, client, row, work):
+    """What runs is not what the file describes."""
+    replaced = PlannedAction("p", Action.REPLACE, "nav", version=2)
+    client.applications = [row]
+    client.apply = lambda *_, **__: ApplyResult("nav version 2: 1 process to replace", (replaced,))
+    result = rosrm("apply", work)
+    assert result.code == 1
+    assert "another request has replaced version 2" in result.err
+
+
+def test_an_apply_of_the_version_that_returned_succeeds(rosrm, client, work):
+    """A newer version was given up before, which this request did not want."""
+    third = VersionRow(3, 1_700_000_020.0, "user:ada", 2, given_up="p: it failed")
+    client.applications = [
+        replace(PAUSED, state="running", reason="", versions=(FIRST, SECOND, third))
+    ]
+    client.apply = lambda *_, **__: ApplyResult("nav is at version 2: nothing changes")
+    result = rosrm("apply", work)
+    assert (result.code, result.err) == (0, "")

@@ -75,6 +75,7 @@ def test_an_application_becomes_equal_to_its_file() -> None:
     kept = cluster["p"].owner
     reply = cluster.apply("nav", process("p"), process("r"))
     assert actions(reply) == {"q": "stop", "r": "start"}
+    assert [one.version for one in reply.actions] == [2, 2]
     cluster.wait(2.0)
     assert [cluster.phase(name) for name in "pqr"] == ["running", "cancelled", "running"]
     assert cluster["p"].owner == kept

@@ -290,8 +290,9 @@ def _actions(prepared: Iterable[Prepared]) -> Iterable[PlannedAction]:
     for one in prepared:
         for name, found in one.found.items():
             yield PlannedAction(
-                name, found.action, one.application.name, fields=found.fields, reason=found.reason
-            )
+                name, found.action, one.application.name, fields=found.fields, reason=found.reason,
+                version=one.number,
+            )  # fmt: skip
 
 
 def _summary(prepared: Sequence[Prepared]) -> str:
