@@ -49,7 +49,6 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
         _review_instance(state, instance, now)
     amendments.review(state, now)
     rollout.review(state, now)
-    switching.review(state, now)
     review_time_limits(state, now)
     review_schedules(state, now)
     review_stops(state, now)
@@ -64,6 +63,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     images.review(state, now)
     review_separated(state, now)
     evict_from_hosts(state, now)
+    switching.review(state, now)  # by the limits that are exceeded now
     preempt(state, now)
     review_rebalancing(state, now)
     replication.review(state, now)

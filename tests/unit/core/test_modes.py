@@ -218,6 +218,40 @@ def test_a_host_that_stays_over_its_limit_puts_a_mode_into_force() -> None:
     assert states(cluster)["docked"] == "in force"
 
 
+def test_a_host_that_stays_over_its_limit_is_no_new_condition_after_a_restart() -> None:
+    """The operator has left the mode, and the master was restarted since."""
+    degraded = replace(DOCKED, when=Trigger(over_limit="memory", lasts=5.0))
+    cluster = in_mode("exploring", EXPLORING, degraded)
+    cluster.machines["b"].busy["memory"] = 0.95
+    cluster.wait(8.0)
+    assert switch(cluster, "exploring").accepted
+    cluster.restart_master()
+    cluster.wait(15.0)
+    assert states(cluster)["exploring"] == "in force"
+    cluster.machines["b"].busy["memory"] = 0.1
+    cluster.wait(3.0)
+    cluster.machines["b"].busy["memory"] = 0.95
+    cluster.wait(8.0)
+    assert states(cluster)["docked"] == "in force"
+
+
+def test_moves_off_a_host_over_its_limit_do_not_begin_the_time_of_a_condition_again() -> None:
+    """A host from which processes are moved in vain needs the mode most."""
+    parts = [movable(f"p{number}") for number in range(3)]
+    degraded = replace(DOCKED, when=Trigger(over_limit="memory", lasts=5.0))
+    cluster = Cluster("a", "b")
+    cluster.set_host("a", "cordon")
+    in_mode("exploring", Mode("exploring", (target("nav", *parts),)), degraded, cluster=cluster)
+    cluster.set_host("a", "uncordon")
+    cluster.machines["b"].busy["memory"] = 0.95
+    for part in parts:
+        cluster.wait(2.0)
+        cluster.migrate(part.name, "a")
+    cluster.wait(2.0)
+    assert [cluster[name].migrations for name in ("p0", "p1")] == [1, 1]
+    assert states(cluster)["docked"] == "in force"
+
+
 def test_a_condition_whose_mode_cannot_be_reached_changes_nothing() -> None:
     """The record says so, once."""
     never = target("dock", process("charger", required_labels={"dock": "yes"}))

@@ -80,7 +80,8 @@ def test_a_pruned_host_registers_as_a_new_host() -> None:
     cluster.wait(1.0)
     drained = cluster.recorded("host_drained")
     host = cluster.state.hosts.by_name["b"]
-    host.over_at["memory"] = host.over_since["memory"] = cluster.now
+    for known in (host.over_at, host.over_since, host.exceeded_since):
+        known["memory"] = cluster.now
     prune(cluster, hosts=("b",))
     cluster.wait(20.0)
     assert (cluster.recorded("host_drained"), cluster.recorded("under_limit")) == (drained, [])

@@ -91,6 +91,7 @@ def _note_limits(state: MasterState, now: float) -> None:
         host.over_at.update({name: now for name in stale if name in host.over_at})
         for name in names:
             host.over_since.setdefault(name, now)
+            host.exceeded_since.setdefault(name, now)
             if name not in host.over_at:
                 state.record(
                     now, EventKind.OVER_LIMIT, f"{host.name} reached its limit of {name}",
@@ -98,7 +99,7 @@ def _note_limits(state: MasterState, now: float) -> None:
                 )  # fmt: skip
             host.over_at[name] = now
         for name in host.over_since.keys() - names:
-            del host.over_since[name]
+            del host.over_since[name], host.exceeded_since[name]
         if len(host.over_at) > len(names):
             _note_under_limit(state, host, now)
 

@@ -25,7 +25,7 @@ from rosrm.core.master.commands import Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.modes.settings import apply_settings, weighted
 from rosrm.core.master.outcomes import RequestRefused
-from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.modes import Modes
 from rosrm.core.master.state.process import ProcessPhase
 from rosrm.errors import RosrmError
@@ -250,9 +250,20 @@ def _holds(state: MasterState, when: Trigger, now: float) -> bool | None:
         known = (HostCondition.LOST, HostCondition.UP)
         return condition is HostCondition.LOST if condition in known else None
     if when.over_limit:
-        since = [host.over_since.get(when.over_limit, inf) for host in state.hosts.listed()]
-        return now - min(since, default=inf) >= when.lasts
+        hosts = state.hosts.listed()
+        since = min((host.exceeded_since.get(when.over_limit, inf) for host in hosts), default=inf)
+        if now - since >= when.lasts:
+            return True
+        # A new master does not know for how long a host has been over its limit.
+        return None if since < inf or any(_is_unread(state, host) for host in hosts) else False
     return None
+
+
+def _is_unread(state: MasterState, host: Host) -> bool:
+    """Return True if a host may be over a limit, but has not reported since this master started."""
+    condition = state.hosts.condition_of(host)
+    unread = condition is HostCondition.UP and bool(state.hosts.without_reading()[host.column])
+    return unread or condition is HostCondition.EXPECTED
 
 
 # --- listing ----------------------------------------------------------------------------------

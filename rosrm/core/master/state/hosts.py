@@ -72,7 +72,8 @@ class Host:
         attributed, shared: resources with this accounting on the host.
         instances: number of each instance that runs on the host or is assigned to it, to the name
             and the spec of its process.
-        over_since: resource name to the time since when the host is over this limit.
+        exceeded_since: resource name to the time since when the host is over this limit.
+        over_since: the same, or the later time of the last move off the host.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
         drained: the host is draining, and no process that can leave is left on it.
@@ -95,6 +96,7 @@ class Host:
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
     instances: dict[int, tuple[str, ProcessSpec]] = field(default_factory=dict)
+    exceeded_since: dict[str, float] = field(default_factory=dict)
     over_since: dict[str, float] = field(default_factory=dict)
     over_at: dict[str, float] = field(default_factory=dict)
     recorded_at: dict[str, float] = field(default_factory=dict)
@@ -180,8 +182,8 @@ class HostTable(HostColumns):
         host.attributed = description.accounted("attributed")
         host.shared = description.accounted("shared")
         self._listed = None
-        host.over_since.clear()
-        host.over_at.clear()
+        for known in (host.exceeded_since, host.over_since, host.over_at):
+            known.clear()
         for resource in description.resources:
             if resource.name not in self.resources:
                 self.add_resource(resource.name)
@@ -223,7 +225,8 @@ class HostTable(HostColumns):
         """Remove a host from every listing; its slave may register it later as a new host."""
         host.pruned, host.description = True, HostDescription(host.name, 0)
         self._listed = None
-        for known in (host.over_since, host.over_at, host.recorded_at, host.blocked, host.failing):
+        limits = host.exceeded_since, host.over_since, host.over_at
+        for known in (*limits, host.recorded_at, host.blocked, host.failing):
             known.clear()
         self.incarnation[host.column] = 0
         self.links.forget(host.column)
