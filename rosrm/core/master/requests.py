@@ -324,12 +324,24 @@ def _restart_fault(state: MasterState, process: Process) -> str:
     if process.name in state.migrations:
         return why_busy(state.migrations[process.name])
     if process.is_at_rest or process.image is not None:
-        return still_stopping(state, process.name)
+        return _why_not_desired(state, process) or still_stopping(state, process.name)
     if process.wanted is not DesiredState.RUN:
         return f"{process.name} is being stopped"
     if process.phase is ProcessPhase.UNREACHABLE:
         return f"{process.name} is out of reach: {process.reason}"
     return ""
+
+
+def _why_not_desired(state: MasterState, process: Process) -> str:
+    """Return why a process that has ended is none of its application any more; "" if it is."""
+    application = state.applications.get(process.spec.application)
+    if application is None or process.name in application.specs:
+        return ""
+    name = application.name
+    if not application.wanted:
+        return f"{process.name} is of {name}, which is cancelled: `rosrm revert {name}` starts it"
+    version = f"version {application.wanted} of {name}"
+    return f"{process.name} is not in {version}: apply a version that has it"
 
 
 def _restart(state: MasterState, process: Process, now: float, by: Requester) -> None:

@@ -10,7 +10,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Reply
-from rosrm.model.applications import Action, ApplicationRow
+from rosrm.model.applications import Action, ApplicationRow, Target
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import StartInstance
 from rosrm.model.requester import Requester
@@ -662,6 +662,25 @@ def test_an_application_is_judged_once_its_hosts_have_reported_again() -> None:
         "degraded",
         f"p is unreachable: {host} is lost",
     )
+
+
+def test_a_process_that_its_application_has_no_more_is_not_restarted() -> None:
+    """It would run beside the version that is in force; a revert brings it back."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), process("q"))
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    assert cluster.restart("q").message == (
+        "q is not in version 2 of nav: apply a version that has it. Nothing was restarted"
+    )
+    cluster.ask(happened.ApplicationsRequested, (Target("nav"),), False)
+    cluster.wait(1.0)
+    assert cluster.restart("p").message == (
+        "p is of nav, which is cancelled: `rosrm revert nav` starts it. Nothing was restarted"
+    )
+    cluster.ask(happened.ApplicationsRequested, (Target("nav", version=1),), False)
+    cluster.wait(1.0)
+    assert [cluster.phase(name) for name in "pq"] == ["running", "running"]
 
 
 def test_an_application_is_degraded_while_an_old_program_runs_in_it() -> None:
