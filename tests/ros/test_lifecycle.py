@@ -84,7 +84,7 @@ def printed(cluster, name: str) -> list[str]:
 
 
 def test_a_node_is_activated_after_its_start_and_after_each_restart(cluster) -> None:
-    """It counts as running only when it is active, also after SIGKILL."""
+    """The process is running only when its node is active, also after SIGKILL."""
     cluster.submit(managed("driver", namespace="/robot", restart=AGAIN))
     before = cluster.wait("driver", "running")
     assert printed(cluster, "driver") == ["configure", "activate"]
@@ -134,7 +134,7 @@ def noted(notes: Path) -> list[tuple[int, str, float]]:
 
 
 def test_a_node_moves_with_a_short_gap(cluster, tmp_path) -> None:
-    """It is configured there, deactivated here, activated there, and ends here; also once more."""
+    """The steps are: configure there, deactivate here, activate there; also in a second move."""
     notes = tmp_path / "notes"
     parameters = {"notes": str(notes)}
     cluster.submit(managed("walker", parameters=parameters, migration=MOVES, restart=AGAIN))

@@ -56,7 +56,7 @@ def at(cluster: Cluster, state: str) -> Any:
 
 
 def test_the_destination_is_active_after_the_source(cluster) -> None:
-    """It is configured beside the active source, and the source ends after the commit."""
+    """The new node is configured beside the active source, which ends after the commit."""
     cluster.migrate("p")
     cluster.discover("p", "b")
     assert (active(cluster), cluster.where("p")) == (["p#1 on a"], ["a", "b"])

@@ -287,7 +287,7 @@ def test_an_order_is_answered_when_the_node_has_reached_the_state() -> None:
 
 
 def test_the_destination_of_a_move_is_activated_by_an_order() -> None:
-    """It is ready when it is inactive, although its spec requires `active`."""
+    """The destination is ready when it is inactive, although its spec requires `active`."""
     slave = Slave()
     slave.assign(spec(), inactive=True)
     slave.status(InstanceState.RUNNING, "n")
@@ -299,7 +299,7 @@ def test_the_destination_of_a_move_is_activated_by_an_order() -> None:
 
 
 def test_a_repeated_order_is_answered_once_and_again() -> None:
-    """The runtime answers all repetitions that wait; a later repetition is answered anew."""
+    """One command answers all repetitions that wait; a later repetition has its own answer."""
     slave = active()
     slave.step(LifecycleOrdered(N, "inactive"))
     read(slave, "active")
