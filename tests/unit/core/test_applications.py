@@ -148,6 +148,21 @@ def test_limits_that_the_slave_refuses_lead_back() -> None:
     assert not cluster.state.unamended
 
 
+def test_refused_limits_stay_open_when_the_paused_version_is_applied_again() -> None:
+    """The application is not as desired until the slave has changed the process."""
+    cluster = Cluster(Machine("a", uses=1e9))
+    cluster.apply("nav", process("p", limits=Limits(memory=2e9)))
+    cluster.wait(1.0)
+    for _ in range(2):
+        cluster.apply("nav", process("p", limits=Limits(memory=5e8)), on_failure="pause")
+        cluster.wait(3.0)
+        assert row(cluster).state == "paused"
+    cluster.machines["a"].uses = 0.0
+    cluster.apply("nav", process("p", limits=Limits(memory=5e8)), on_failure="pause")
+    cluster.wait(3.0)
+    assert (row(cluster).state, state_of(cluster)) == ("running", (2, []))
+
+
 def test_a_change_may_overtake_the_assignment() -> None:
     """The slave does not know the instance yet, which is no fault of the new version."""
     cluster = Cluster("a")

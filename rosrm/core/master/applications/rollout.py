@@ -292,7 +292,9 @@ def _set_wanted(
     ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]
     order = dict.fromkeys([one.name for one in dependants_first(state, ending)]) | found
     begun = {name: Task(replaces=found[name].action is Action.REPLACE) for name in order}
-    application.tasks = {**begun, **tasks}
+    # Their specs do not differ, but their slaves have not changed them, or have refused it.
+    unamended = {name: Task() for name in application.tasks if name in state.unamended}
+    application.tasks = {**unamended, **begun, **tasks}
     state.save_application(application)
     _review(state, application, now)
 
