@@ -33,7 +33,8 @@ setup(
     name=project["name"],
     version=re.search("<version>(.+)</version>", (here / "package.xml").read_text("utf-8"))[1],
     packages=find_packages(include=[top.name, f"{top.name}.*"]),
-    package_data={"": ["*"], top.name: ["**/*"]},
+    package_data={top.name: ["**/*"]},
+    exclude_package_data={top.name: ["__pycache__/*", "**/__pycache__/*"]},
     data_files=[
         (to, [os.path.relpath(one, here) for one in found]) for to, found in files.items() if found
     ],
