@@ -86,7 +86,7 @@ def test_a_policy_for_a_process_of_a_killed_slave(cluster, orders) -> None:
 def test_a_policy_for_an_unknown_instance_is_refused(orders) -> None:
     """The refusal has a code for programs and a reason for users."""
     answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
-    assert (answer.accepted, answer.code) == (False, "not_amended")
+    assert (answer.accepted, answer.code) == (False, "unknown")
     assert "nobody#99 is not known here" in answer.message
 
 
