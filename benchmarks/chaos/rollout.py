@@ -13,7 +13,7 @@ from benchmarks.chaos.oracle import Versions
 
 
 class Rollout:
-    """The application of the benchmark, whose processes get version after version.
+    """The application of the benchmark, and the requests for its versions, one after the other.
 
     Args:
         folder: for the work files.
@@ -40,7 +40,7 @@ class Rollout:
         self.is_settled = True
 
     def apply(self, *, faulty: bool) -> None:
-        """Request the next version; of a faulty one, each time another process ends."""
+        """Request the next version; in a faulty one, one process ends, each time another."""
         self._number += 1
         number, self._versions.newest = self._number, self._number
         names = [one.name for one in work.rolled()]
@@ -58,7 +58,7 @@ class Rollout:
             self._send(request, self._take, persistent=False)
 
     def close(self) -> None:
-        """Let the version that runs be the only one, until another is applied."""
+        """Expect only the version that runs, until another is applied."""
         versions = self._versions
         versions.former = versions.newest = versions.expected
         versions.returned, versions.repeated = "", False

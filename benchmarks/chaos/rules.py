@@ -163,12 +163,12 @@ def _judge_state(
 def judge_versions(
     name: str, chained: Sequence[Run], former: int, newest: int, *, may_return: bool
 ) -> list[Violation]:
-    """Return a violation if a process of an application went through other versions than asked.
+    """Return a violation if a process of an application has run other versions than requested.
 
     Args:
         former: that ran before.
         newest: that was requested.
-        may_return: the application went back, so that `former` may follow `newest`.
+        may_return: the application has returned, so that `former` may follow `newest`.
     """
     versions = [run.version for run in chained]
     if {*versions} <= {former, newest} and (may_return or versions == sorted(versions)):

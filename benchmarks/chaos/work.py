@@ -128,7 +128,7 @@ def guest(number: int) -> Service:
 
 
 def rolled() -> Iterator[Service]:
-    """Yield the processes of the application that gets new versions: one of each way to replace."""
+    """Yield the processes of the application that gets new versions, one for each strategy."""
     for word in ("plain", "speaker", "counter"):
         yield Service(f"{APPLICATION}_{word}", _SORTS[word][0])
 

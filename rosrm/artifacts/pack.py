@@ -130,7 +130,9 @@ class Archive:
 def changed(source: str | Path) -> Refused:
     """Return the refusal of contents that differ from their digest."""
     return Refused(
-        f"{source} changed while it was sent; nothing was queued: submit again", "changed"
+        f"{source} changed while it was sent: run the command again once no program writes to it. "
+        f"Nothing was changed",
+        "changed",
     )
 
 

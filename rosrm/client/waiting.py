@@ -166,7 +166,7 @@ def _watch(
         names: of the applications; None: all.
     """
     deadline = deadline_after(timeout)
-    seen: dict[str, ApplicationRow] = {}
+    seen: dict[str, tuple[int, Mapping[str, str]]] = {}
     while True:
         view = ask_until_answered(
             lambda on_wait: master.list(applications=True, modes=True, on_wait=on_wait),
@@ -175,9 +175,9 @@ def _watch(
         for row in view.applications:
             if names is not None and row.name not in names:
                 continue
-            if row.pending and seen.get(row.name) != row:
+            if row.pending and seen.get(row.name) != (row.version, row.pending):
                 on_change(row)
-            seen[row.name] = row
+            seen[row.name] = row.version, row.pending
         if is_done(view) or time.monotonic() >= deadline:
             return view
         time.sleep(PERIOD)

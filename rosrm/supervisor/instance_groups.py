@@ -315,9 +315,9 @@ def _uses(used: float, limits: LimitRule) -> str:
 
 
 def _above(path: str, tree: Tree, limits: LimitRule) -> str:
-    """Return why a limit of memory would kill the processes of a group of version 2; "": not.
+    """Return why a limit of memory is below the usage of a group of version 2; "": it is not.
 
-    Version 1 refuses such a limit, version 2 obeys it.
+    Version 1 refuses such a limit. Version 2 accepts it, and kills processes of the group.
     """
     if not limits.memory or tree.version == 1 or "memory" not in tree.controllers:
         return ""

@@ -52,7 +52,7 @@ The supervisor sends messages; the key `tell` names the message:
                                                    groups: [version, directory, controllers] where
                                                    the control groups of instances are
                                                    secrets: true, for it reads them at each start
-                                                   amends: true, for it can change limits
+                                                   amends: true: it can change limits
     status       status                            a change, or the answer to a repeated order
     amended      instance, restart, limits,        the amendment is recorded; its status came before
                  refusal                           refusal: "", or why nothing has changed

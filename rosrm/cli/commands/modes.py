@@ -86,7 +86,7 @@ def _switch(
 
     limit = longest(timeout)
     result = begin(request, plan=plan, no_wait=no_wait, as_json=as_json)
-    with interruptible("the cluster goes on with the switch (`rosrm mode`)"):
+    with interruptible("the switch continues (`rosrm mode`)"):
         rows = client.wait_for_mode(timeout=limit, on_change=applications.show_progress)
     print_elsewhere(client, result)
     if not modes.show_end(rows, name):

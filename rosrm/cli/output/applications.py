@@ -90,5 +90,7 @@ def show_end(row: ApplicationRow, requested: int = 0) -> bool:
         is_done, why = False, f"another request has replaced version {requested}"
     version = f" at version {row.version}" if row.version else ""
     text = f"{row.name} is {row.state}{version}" + (f": {why}" if why else "")
+    if row.state in ("applying", "returning"):
+        text = f"--timeout has passed: {text} (`rosrm explain PROCESS` gives the details)"
     echo(text if is_done else f"rosrm: {text}", err=not is_done)
     return is_done

@@ -370,7 +370,7 @@ class Destination:
     def _end(self, phase: int, message: str) -> None:
         """Abandon the handoff for good; this process then runs until its slave stops it."""
         self._ended, self._fault = True, message
-        self._entities.node.get_logger().warning(f"will not take over: {message}")
+        self._entities.node.get_logger().warning(f"this instance will not take over: {message}")
         if self._channel is not None:
             self._channel.report(phase, self._sequence(), message)
         self._unfollow()

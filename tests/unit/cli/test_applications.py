@@ -79,3 +79,12 @@ def test_an_apply_of_the_version_that_returned_succeeds(rosrm, client, work):
     client.apply = lambda *_, **__: ApplyResult("nav is at version 2: nothing changes")
     result = rosrm("apply", work)
     assert (result.code, result.err) == (0, "")
+
+
+def test_the_end_of_the_time_for_an_apply_is_said(rosrm, client, work):
+    """The application is still under way then."""
+    client.applications = [replace(PAUSED, state="applying", reason="", pending={"p": "it starts"})]
+    client.apply = lambda *_, **__: ApplyResult("nav version 2: 1 process to start")
+    result = rosrm("apply", work, "--timeout", "1ms")
+    assert result.code == 1
+    assert "rosrm: --timeout has passed: nav is applying at version 2: p: it starts" in result.err

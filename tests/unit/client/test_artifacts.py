@@ -81,7 +81,7 @@ def test_a_changed_file_is_refused_by_its_name(big, monkeypatch):
         return first(self, digest, size, offset, data)
 
     monkeypatch.setattr(Master, "store_artifact", change)
-    with pytest.raises(Refused, match=r"big.bin changed while it was sent.*submit again"):
+    with pytest.raises(Refused, match=r"big.bin changed while it was sent: run the command again"):
         send_artifacts(master, [spec("a", big)], no_note)
     assert not master.stored
 

@@ -141,7 +141,7 @@ def test_limits_that_the_slave_refuses_lead_back() -> None:
     owner = cluster["p"].owner
     cluster.apply("nav", process("p", limits=Limits(memory=5e8)))
     cluster.wait(3.0)
-    why = "nav returns from version 2 to 1: p: it is not changed: it uses 1e+09 B already"
+    why = "nav returns from version 2 to 1: p: its slave refuses: it uses 1e+09 B already"
     assert why in cluster.recorded("application_returns")
     assert (state_of(cluster), cluster["p"].owner) == ((1, []), owner)
     assert cluster["p"].spec.limits == Limits(memory=2e9)
@@ -180,6 +180,20 @@ def test_a_change_may_overtake_the_assignment() -> None:
     assert (cluster.phase("q"), state_of(cluster)) == ("running", (3, []))
     (held,) = [one for key, one in machine.programs.items() if key.process == "q"]
     assert held.restart == RestartPolicy("always")
+
+
+def test_the_next_version_waits_for_unfinished_work_on_the_one_before() -> None:
+    """A process that both versions have, and that does not run yet, is not as desired."""
+    cluster = Cluster("a")
+    full = process("p", 20_000)
+    cluster.apply("nav", full)
+    reply = cluster.apply("nav", full, process("q"))
+    assert [(one.process, one.version) for one in reply.actions] == [("q", 2)]
+    cluster.wait(2.0)
+    assert (row(cluster).state, state_of(cluster)) == ("applying", (2, ["p"]))
+    cluster.apply("nav", process("q"))
+    cluster.wait(2.0)
+    assert (row(cluster).state, state_of(cluster)) == ("running", (3, []))
 
 
 def test_a_process_in_the_queue_gets_its_new_spec() -> None:

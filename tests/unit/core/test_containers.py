@@ -33,7 +33,9 @@ def test_a_process_waits_until_a_host_offers_its_engine() -> None:
     cluster.submit(process("p", container=Container("ros:jazzy", "podman")), process("q"))
     assert cluster.where("q") == ["a"]
     reason = cluster.explain("p")["reason"]
-    assert "no host offers podman for containers (launchers there: criu)" in reason
+    assert (
+        "no host offers podman for containers (only criu): install podman and its plugin" in reason
+    )
 
 
 def test_a_container_cannot_move_by_a_strategy_that_moves_state() -> None:

@@ -35,7 +35,7 @@ def note_answer(state: MasterState, change: InstanceAmendment, event: OrderAnswe
         del state.unamended[process.name]
         state.save(process)
     elif event.code == NOT_AMENDED and task is not None:
-        task.fault = f"it is not changed: {event.message}"
+        task.fault = f"its slave refuses: {event.message}"
 
 
 def _amendment(spec: ProcessSpec) -> Amendment:

@@ -95,10 +95,12 @@ def _want_all(state: MasterState, prepared: Sequence[Prepared], by: Requester, n
 
 def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> list[Prepared]:
     """Return the checked targets; refuse the request as a whole."""
-    _refuse_twice((one.application for one in targets), "application")
+    _refuse_twice(
+        (one.application for one in targets), "application", "put all its processes into one file"
+    )
     versions = [_version_of(state, one, by) for one in targets]
     wanted = [spec for version in versions if version for spec in version.specs.values()]
-    _refuse_twice((spec.name for spec in wanted), "process")
+    _refuse_twice((spec.name for spec in wanted), "process", "names are unique")
     prepared = []
     for target, version in zip(targets, versions, strict=True):
         specs: Mapping[str, ProcessSpec] = {} if version is None else version.specs
@@ -112,11 +114,11 @@ def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> l
     return prepared
 
 
-def _refuse_twice(names: Iterable[str], what: str) -> None:
+def _refuse_twice(names: Iterable[str], what: str, rule: str) -> None:
     twice = [name for name, number in Counter(names).items() if number > 1]
     if twice:
         raise RequestRefused(
-            f"the {what} {listed(twice)} is given twice; names are unique. Nothing was changed",
+            f"the {what} {listed(twice)} is given twice: {rule}. Nothing was changed",
             "name_taken",
         )
 
@@ -145,7 +147,7 @@ def _new_version(
     """Return the version of given specs: the desired one, if it is the same."""
     defaults = state.settings.process_defaults
     filled = [with_defaults(spec, defaults) for spec in target.specs]
-    _refuse_twice((spec.name for spec, _ in filled), "process")
+    _refuse_twice((spec.name for spec, _ in filled), "process", "names are unique")
     strangers = [spec.name for spec, _ in filled if spec.application != target.application]
     if strangers:
         raise RequestRefused(
@@ -263,7 +265,7 @@ def _note_change(state: MasterState, one: Prepared, by: Requester, now: float) -
         )
     number = one.number
     if number == application.wanted and not one.found and not application.paused:
-        return False  # what is not done yet goes on
+        return False  # unfinished work continues
     if version is not None and version.number > application.newest:
         application.newest = version.number
         state.save_version(application, version)

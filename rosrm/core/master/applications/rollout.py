@@ -266,13 +266,14 @@ def _handle_fault(
 def want(state: MasterState, application: Application, number: int, now: float) -> None:
     """Make a version the desired one on request, and begin the work on it; 0: no version.
 
-    Work on the desired version goes on if the same is requested again.
+    Unfinished work continues if the same version is requested again; otherwise only on processes
+    that the new version does not change.
     """
     same = number == application.wanted
     # The version before may be one that was not reached yet.
     former = application.former if application.tasks or same else application.wanted
-    going_on = application.tasks if same and not application.paused else {}
-    _set_wanted(state, application, number, now, former=former if number else 0, tasks=going_on)
+    unfinished = {} if application.paused else application.tasks
+    _set_wanted(state, application, number, now, former=former if number else 0, tasks=unfinished)
 
 
 def _set_wanted(
@@ -283,8 +284,9 @@ def _set_wanted(
 
     Args:
         former: number of the version to which a failure leads back; 0: none.
-        tasks: work that goes on.
+        tasks: unfinished work; it continues where the version is the same or changes nothing.
     """
+    same = number == application.wanted
     application.returning = bool(application.former and not former and number)
     application.wanted, application.former, application.paused = number, former, ""
     names = state.names_of(application.name)
@@ -294,7 +296,10 @@ def _set_wanted(
     begun = {name: Task(replaces=found[name].action is Action.REPLACE) for name in order}
     # Their specs do not differ, but their slaves have not changed them, or have refused it.
     unamended = {name: Task() for name in application.tasks if name in state.unamended}
-    application.tasks = {**unamended, **begun, **tasks}
+    unchanged = application.specs.keys() - found.keys()
+    live = {name for name in unchanged if not state.processes[name].phase.is_terminal}
+    unfinished = {name: task for name, task in tasks.items() if same or name in live}
+    application.tasks = {**unamended, **begun, **unfinished}
     state.save_application(application)
     _review(state, application, now)
 

@@ -179,4 +179,8 @@ def _no_engine(table: HostTable, demand: Demand) -> str:
     if not engine or table.launching(engine).any():
         return ""
     there = {name for host in table.hosts for name in host.description.launchers}
-    return f"no host offers {engine} for containers (launchers there: {listed(sorted(there))})"
+    others = f" (only {listed(sorted(there))})" if there else ""
+    return (
+        f"no host offers {engine} for containers{others}: install {engine} and its plugin on a "
+        f"host, and restart the slave"
+    )

@@ -148,7 +148,7 @@ class Migration:
         """Return the reason shown for the process during the migration."""
         host = self.destination_host.name
         if self.spec is not None:
-            return f"it is replaced on {host} by its new version"
+            return f"it is being replaced on {host}"
         return {
             Aim.MOVE: f"to {host}",
             Aim.CHECKPOINT: f"it is being checkpointed on {host}",
