@@ -172,7 +172,7 @@ class _Job:
                 story = ask_until_answered(lambda _: self.client.explain(self.name), note)
                 note(f"{self.name} waits for a host: {story['reason'] or 'no reason is known yet'}")
                 if row.state == "set_aside":
-                    note("Ctrl-C cancels it; then run it again with other `--needs` or `--label`")
+                    note("Ctrl-C cancels it; then run it again with other `--needs` or `--on`")
         elif row.state in _NOTEWORTHY and row.state not in self._reported:
             self._reported.add(row.state)
             show_change(row)

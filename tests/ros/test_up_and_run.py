@@ -123,7 +123,8 @@ def test_a_job_of_the_command_line(make_cluster, tmp_path) -> None:
 
     waits = ("run", "--name", "big", "--needs", "memory=1TB", "--", "true")
     with terminal.start(*waits, start_new_session=True) as process:
-        assert "big waits for a host: " in read_until(process.stderr.fileno(), "waits for")
+        said = read_until(process.stderr.fileno(), "run it again with other `--needs` or `--on`")
+        assert "big waits for a host: " in said
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE) == 128 + signal.SIGTERM
     assert cluster.ended("big").state == "cancelled"
