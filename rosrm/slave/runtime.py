@@ -12,6 +12,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -63,7 +64,9 @@ from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.interfaces import own_address
+from rosrm.slave.launch.ament_index import search_path
 from rosrm.slave.launch.launchers import Launchers
+from rosrm.slave.launch.packages import component_with_packages
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
@@ -158,7 +161,9 @@ class SlaveRuntime:
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._clients = InstanceClients(self._participant)
             self._lifecycle_clients = LifecycleClients(self._clients, self._take)
-            self._component_loads = ComponentLoads(self._clients, self._take)
+            prefixes = search_path(os.environ, sys.executable)
+            located = partial(component_with_packages, prefixes=prefixes)
+            self._component_loads = ComponentLoads(self._clients, self._take, located)
             self._note_probes(first)
             self._note_broken(offered.broken)
             name = f"{self._participant.node.get_name()}_flows"

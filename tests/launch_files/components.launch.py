@@ -3,7 +3,7 @@
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction
 from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import (
     ComposableNodeContainer,
     LoadComposableNodes,
@@ -11,6 +11,9 @@ from launch_ros.actions import (
     PushRosNamespace,
 )
 from launch_ros.descriptions import ComposableNode
+from launch_ros.substitutions import FindPackageShare
+
+SHARE = FindPackageShare("demo_robot")
 
 
 def generate_launch_description():
@@ -27,8 +30,18 @@ def generate_launch_description():
                         namespace="",
                         composable_node_descriptions=[
                             ComposableNode(
-                                package="demo_parts", plugin="demo::Camera", name="source"
+                                package="demo_parts",
+                                plugin="demo::Camera",
+                                name="source",
+                                parameters=[
+                                    {"rate": 30, "offset": [0.5, 1.0]},
+                                    {"map": PathJoinSubstitution([SHARE, "maps/hall.yaml"])},
+                                    PathJoinSubstitution([SHARE, "config/params.yaml"]),
+                                ],
+                                remappings=[("image", "raw")],
+                                extra_arguments=[{"use_intra_process_comms": True}],
                             ),
+                            ComposableNode(package="demo_parts", plugin="demo::Unnamed"),
                             ComposableNode(
                                 package="demo_parts",
                                 plugin="demo::Viewer",

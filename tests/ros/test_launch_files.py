@@ -86,14 +86,31 @@ def test_events_and_timers_of_a_launch_file(cluster) -> None:
     assert set(ends.values()) == {"cancelled"}
 
 
-@pytest.mark.parametrize(
-    "name",
-    ["sensors.launch.xml", "tools.launch.yaml", "lifecycle.launch.py", "components.launch.xml"],
-)
+@pytest.mark.parametrize("name", ["sensors.launch.xml", "tools.launch.yaml", "lifecycle.launch.py"])
 def test_the_processes_of_each_other_file_run(cluster, name) -> None:
-    """XML, YAML, lifecycle nodes in the required states, and containers without components."""
+    """XML, YAML, and lifecycle nodes in the required states."""
     target = target_of(name)
     cluster.client.apply([target])
     for spec in target.specs:
         cluster.wait(spec.name, "running")
+    remove(cluster, target)
+
+
+def test_the_components_of_a_launch_file_are_loaded_into_their_container(cluster) -> None:
+    """The ROS wheels have no components in C++, so rosrm's container takes their place."""
+    pytest.importorskip("composition_interfaces")
+    model = json.dumps(stored("components.launch.xml"))
+    for plugin in ("demo::A", "demo::B"):
+        model = model.replace(plugin, "tests.ros.programs.components:Talker")
+    path = Path("/robot/components.launch.xml")
+    translation = translated(LaunchModel.model_validate_json(model))
+    container = translation.work["processes"][0]
+    del container["package"], container["executable"]
+    container |= {"module": "rosrm.node.container", "ros": True}
+    container["environment"] = {"PYTHONPATH": str(Path(__file__).parents[2])}
+    target = checked_work(completed(translation, path, None), path, None)
+    cluster.client.apply([target])
+    cluster.wait("pool", "running")
+    assert "/a says nothing" in cluster.log("pool")
+    assert "/x/b says nothing" in cluster.log("pool")
     remove(cluster, target)

@@ -11,6 +11,7 @@ from rclpy.parameter import Parameter
 
 from rosrm.core.slave import events
 from rosrm.core.slave.commands import ListComponents, LoadComponent
+from rosrm.errors import LaunchError
 from rosrm.model.values import Component
 from rosrm.ros.slave.instance_clients import InstanceClients
 
@@ -27,11 +28,17 @@ class ComponentLoads:
 
     Args:
         take: takes events for the core.
+        located: returns a component with the directories of packages on this host in its
+            parameters; raises `LaunchError`.
     """
 
-    def __init__(self, clients: InstanceClients, take: Callable[[events.Event], None]) -> None:
+    def __init__(
+        self, clients: InstanceClients, take: Callable[[events.Event], None],
+        located: Callable[[Component], Component],
+    ) -> None:  # fmt: skip
         self._clients = clients
         self._take = take
+        self._located = located
 
     def send(self, request: ListComponents | LoadComponent, now: float) -> None:
         """Send a request to a container; its answer becomes an event."""
@@ -73,6 +80,11 @@ class ComponentLoads:
     def _load(self, srv: Any, request: LoadComponent) -> None:
         """Order a container to load a component, however long its constructor takes."""
         instance, pid, component = request.instance, request.pid, request.component
+        try:
+            located = self._located(component)
+        except LaunchError as error:
+            self._take(events.ComponentLoaded(instance, pid, component, str(error)))
+            return
         client = self._clients.get(instance, srv.LoadNode, f"{request.services}/load_node")
 
         def answered(response: Any) -> None:
@@ -82,7 +94,7 @@ class ComponentLoads:
             fault = "" if response.success else response.error_message or unsaid
             self._take(events.ComponentLoaded(instance, pid, component, fault))
 
-        self._clients.call(client, load_request(srv, component), inf, answered)
+        self._clients.call(client, load_request(srv, located), inf, answered)
 
 
 def load_request(srv: Any, component: Component) -> Any:

@@ -33,12 +33,15 @@ class Wait(_Part):
 
 
 class Component(_Part):
-    """Component that a container loads."""
+    """Component that a container loads; parameters as in `Parameters.values`."""
 
     package: str
     plugin: str
     name: str = ""
     namespace: str = ""
+    parameters: dict[str, Any] = {}
+    remappings: list[tuple[str, str]] = []
+    arguments: dict[str, Any] = {}
 
 
 class Process(_Part):

@@ -14,13 +14,12 @@ from rosrm.model.description_checks import is_node_name
 from rosrm.model.parameters import SECTION, merged_parameters
 from rosrm.model.values import KEEP_NAME, ParameterSource, qualified_name
 from rosrm.wording import listed
-from rosrm_launch.model import LaunchModel, Omission, Process
+from rosrm_launch.model import Component, LaunchModel, Load, Omission, Process
 
 #: Restarts of a process that launch starts again without end.
 _ENDLESS: Final = 2**31 - 1
 #: Most processes that one start order names.
 _MOST_AWAITED: Final = 256
-_NOT_YET: Final = "cannot be translated yet"
 #: Transition of a lifecycle node to the state to which its host brings it.
 _GOALS: Final = {"configure": "inactive", "activate": "active", "autostart": "active"}
 #: Characters that no name of a process has.
@@ -68,12 +67,12 @@ class _Translator:
         self._started = self._without_endless_waits(model.processes)
         self._names = dict(zip((one.number for one in self._started), self._chosen(), strict=True))
         self._lifecycle = self._lifecycle_goals()
+        self._components = self._components_by_container()
         self._jobs = {
             wait.process for one in self._started for wait in one.waits if wait.event == "exited"
         }
 
     def run(self) -> Translation:
-        self._note_parts()
         if not self._started:
             raise ConfigError(f"{self._model.file}: the launch file starts no process")
         work: dict[str, Any] = {"app": self._application}
@@ -111,21 +110,49 @@ class _Translator:
             used.add(name)
             yield name
 
-    def _note_parts(self) -> None:
-        """List components, and refuse containers that cannot be told apart."""
-        model = self._model
-        containers = [one for one in model.processes if one.kind == "container"]
-        for node, count in Counter(map(_node_of, containers)).items():
-            if count > 1:
-                files = listed(sorted({one.file for one in containers if _node_of(one) == node}))
-                raise ConfigError(f"{files}: {count} containers have the name {node}; rename one")
-        for one in containers:
-            if one.components:
-                plugins = listed([part.plugin for part in one.components])
-                self._omit(one, f"container {_node_of(one)}", f"loading {plugins} {_NOT_YET}")
-        for load in model.loads:
-            plugins = listed([part.plugin for part in load.components])
-            self._omit(load, f"LoadComposableNodes into {load.container}", f"{plugins}: {_NOT_YET}")
+    def _components_by_container(self) -> dict[str, list[dict[str, Any]]]:
+        """Return the components of each container in order; list those that cannot be loaded.
+
+        Raises:
+            ConfigError: two containers cannot be told apart.
+        """
+        nodes = [one for one in self._started if one.kind != "command"]
+        containers = [one for one in nodes if one.kind == "container"]
+        parts: list[tuple[Process | Load, str, Component]] = [
+            (one, _node_of(one), part) for one in containers for part in one.components
+        ]
+        parts += [
+            (load, f"/{load.container.strip('/')}", part)
+            for load in self._model.loads
+            for part in load.components
+        ]
+        targets = {container for _, container, _ in parts} | set(map(_node_of, containers))
+        known = Counter(map(_node_of, nodes))  # a container may be started as a plain node
+        for node in targets - {""}:
+            if known[node] > 1:
+                files = listed(sorted({one.file for one in nodes if _node_of(one) == node}))
+                raise ConfigError(
+                    f"{files}: {known[node]} containers have the name {node}; rename one"
+                )
+        found: dict[str, list[dict[str, Any]]] = {}
+        for at, container, part in parts:
+            title = f"component {part.plugin} of {container or 'a container without a name'}"
+            if not container or not known[container]:
+                self._omit(at, title, "the file starts no node of this name")
+            elif not part.name:
+                self._omit(at, title, "it has no name, by which its host could find it again")
+            else:
+                found.setdefault(container, []).append(self._component(part))
+        return found
+
+    def _component(self, part: Component) -> dict[str, Any]:
+        entry = {
+            "package": part.package, "plugin": part.plugin, "name": part.name,
+            "namespace": part.namespace.rstrip("/"),
+            "parameters": self._paths.in_texts(part.parameters),
+            "remappings": _remappings(part.remappings), "arguments": part.arguments,
+        }  # fmt: skip
+        return {key: value for key, value in entry.items() if value}
 
     def _lifecycle_goals(self) -> dict[str, str]:
         """Return the state to which the file brings each node; list all other transitions."""
@@ -170,6 +197,7 @@ class _Translator:
             "environment": self._paths.in_texts(one.environment),
             "working_directory": self._paths.in_texts(one.working_directory),
             "lifecycle": self._lifecycle.get(_node_of(one), ""),
+            "components": self._components.get(_node_of(one), []),
             "kind": "job" if one.number in self._jobs else "",
             "restart": _restart(one),
             "stop": _stop(one),

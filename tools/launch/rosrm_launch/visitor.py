@@ -11,12 +11,13 @@ from __future__ import annotations
 import asyncio
 import os
 import shutil
+from array import array
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from ament_index_python.packages import get_packages_with_prefixes
 from launch import LaunchContext
@@ -31,11 +32,11 @@ from launch.utilities import normalize_to_list_of_substitutions, perform_substit
 from launch.utilities.type_utils import perform_typed_substitution
 from launch_ros import actions as ros
 from launch_ros.actions.lifecycle_transition import LifecycleTransition
+from launch_ros.actions.load_composable_nodes import get_composable_node_load_request
 from launch_ros.actions.ros_timer import ROSTimer
 from launch_ros.event_handlers import OnStateTransition
 from launch_ros.events.lifecycle import ChangeState, StateTransition
 from launch_ros.substitutions import ExecutableInPackage
-from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 from lifecycle_msgs.msg import State, TransitionEvent
 
 from rosrm.wording import get_close_matches, listed
@@ -292,19 +293,18 @@ class _Visitor:
         self.record.loads.append(load)
 
     def _components(self, described: Sequence[Any]) -> list[Component]:
+        """Return the components whose conditions hold, as launch would request them."""
+        requests = (get_composable_node_load_request(one, self.context) for one in described)
         return [
             Component(
-                package=self._text(one.package), plugin=self._text(one.node_plugin),
-                name=self._text(one.node_name), namespace=self._namespace(one.node_namespace),
+                package=one.package_name, plugin=one.plugin_name, name=one.node_name,
+                namespace=one.node_namespace, parameters=_values(one.parameters),
+                remappings=[tuple(rule.split(":=", 1)) for rule in one.remap_rules],
+                arguments=_values(one.extra_arguments),
             )
-            for one in described
-            if one.condition() is None or one.condition().evaluate(self.context)
+            for one in requests
+            if one is not None
         ]  # fmt: skip
-
-    def _namespace(self, given: Any) -> str:
-        base = self.context.launch_configurations.get("ros_namespace")
-        own = None if given is None else self._text(given)
-        return make_namespace_absolute(prefix_namespace(base, own)) or ""
 
     def _text(self, given: Any) -> str:
         if given is None:
@@ -494,3 +494,19 @@ def _unknown(names: Sequence[str], known: Sequence[str]) -> str:
     hint = f"; did you mean {listed(close, 'or')}?" if close else ""
     own = listed(list(known)) if known else "none"
     return f"it declares no argument {listed(list(names))}{hint or '.'} Its arguments: {own}"
+
+
+#: Field of a parameter's value, by its type.
+_FIELDS: Final = (
+    "", "bool_value", "integer_value", "double_value", "string_value", "byte_array_value",
+    "bool_array_value", "integer_array_value", "double_array_value", "string_array_value",
+)  # fmt: skip
+
+
+def _values(parameters: Sequence[Any]) -> dict[str, Any]:
+    """Return ROS parameters in messages as values of JSON."""
+    found = {}
+    for one in parameters:
+        value = getattr(one.value, _FIELDS[one.value.type])
+        found[one.name] = list(value) if isinstance(value, array) else value
+    return found

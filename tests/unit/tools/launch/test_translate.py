@@ -10,7 +10,7 @@ from rosrm.config.work import checked_work
 from rosrm.errors import ConfigError
 from rosrm.model.values import GroupMembership, Kind, RestartPolicy, StartOrder, StopPolicy
 from rosrm_launch.beside import completed
-from rosrm_launch.model import LaunchModel, Parameters, Process, Transition, Wait
+from rosrm_launch.model import Component, LaunchModel, Load, Parameters, Process, Transition, Wait
 from rosrm_launch.translate import translated
 from tests.launch_files import CASES, stored
 
@@ -123,19 +123,50 @@ def test_transitions_of_unknown_nodes_are_listed():
     [
         ("events.launch.py", ["OnProcessIO", "OnProcessExit", "OnShutdown", "EmitEvent"]),
         ("lifecycle.launch.py", ["OnStateTransition", "transition inactive_shutdown of /maps"]),
-        (
-            "components.launch.py",
-            ["container /camera/pipeline", "LoadComposableNodes into /camera/pipeline"],
-        ),
-        ("components.launch.xml", ["container /pool", "LoadComposableNodes into /pool"]),
+        ("components.launch.py", ["component demo::Unnamed of /camera/pipeline"]),
+        ("components.launch.xml", []),
         ("talkers.launch.py", []),
     ],
 )  # fmt: skip
 def test_what_has_no_counterpart_is_listed_with_its_file(name, said):
-    """Components and other transitions are listed, and their processes run."""
+    """Components without a name and other transitions are listed, and their processes run."""
     omissions = translation_of(name).omissions
     assert [one.action for one in omissions] == said
     assert all(one.file.endswith(f"demo_robot/launch/{name}") for one in omissions)
+
+
+def test_components_are_those_of_their_container_in_order():
+    """First those that the container names, then those that are loaded into it by its name."""
+    pipeline, _ = translation_of("components.launch.py").work["processes"]
+    camera = {
+        "package": "demo_parts", "plugin": "demo::Camera", "name": "source",
+        "namespace": "/camera", "remappings": {"image": "raw"},
+        "parameters": {
+            "rate": 1.0, "offset": [0.5, 1.0], "tolerance": "1e-3",
+            "map": "$(find-pkg-share demo_robot)/maps/hall.yaml",
+        },
+        "arguments": {"use_intra_process_comms": True},
+    }  # fmt: skip
+    filtering = {"package": "demo_parts", "plugin": "demo::Filter", "name": "filter"}
+    assert pipeline["components"] == [camera, {**filtering, "namespace": "/camera"}]
+    pool, _ = translation_of("components.launch.xml").work["processes"]
+    assert [one["name"] for one in pool["components"]] == ["a", "b"]
+
+
+def test_a_container_may_be_a_plain_node():
+    """The launch file of Nav2 starts it so, and loads all components by its name."""
+    part = Component(package="p", plugin="q", name="map")
+    work = made(node(0, "c"), loads=[Load(file="f", container="c", components=[part])]).work
+    assert work["processes"][0]["components"] == [{"package": "p", "plugin": "q", "name": "map"}]
+
+
+def test_components_of_a_container_that_the_file_does_not_start_are_listed():
+    """Another application has the container, or launch would wait for it without end."""
+    load = Load(file="f", container="other", components=[Component(package="p", plugin="q")])
+    omissions = made(node(0, "c", kind="container"), loads=[load]).omissions
+    assert [(one.action, one.reason) for one in omissions] == [
+        ("component q of /other", "the file starts no node of this name")
+    ]
 
 
 def test_a_path_outside_of_packages_is_noted():
