@@ -694,7 +694,7 @@ def test_an_application_is_judged_once_its_hosts_have_reported_again() -> None:
 
 
 def test_a_process_that_its_application_has_no_more_is_not_restarted() -> None:
-    """It would run beside the version that is in force; a revert brings it back."""
+    """The process would run beside the version in force. A revert starts it again."""
     cluster = Cluster("a")
     cluster.apply("nav", process("p"), process("q"))
     cluster.apply("nav", process("p"))
