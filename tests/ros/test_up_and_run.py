@@ -26,6 +26,15 @@ processes:
 """
 
 
+APPLICATION = """
+app: nav
+processes:
+  - name: greeter
+    command: [sh, -c, "cat {artifacts}/greeting.txt; exec sleep 1000"]
+    artifacts: {greeting.txt: ./greeting.txt}
+"""
+
+
 @contextmanager
 def started(terminal: Terminal, *words: str) -> Iterator[tuple[subprocess.Popen, str]]:
     """Start `rosrm up`; yield it and its output once both sleepers are ready."""
@@ -78,6 +87,21 @@ def test_ctrl_c_ends_all_that_up_has_started(terminal, tmp_path) -> None:
     assert "ended; nothing runs any more" in rest
     assert not any(alive(pid) for pid in [row["pid"] for row in rows] + [p.pid for p in parts])
     assert list((tmp_path / "temporary").iterdir()) == []
+
+
+def test_a_file_with_an_application_is_applied(terminal) -> None:
+    """Its artifacts are sent before, and the progress is shown."""
+    terminal.file("greeting.txt", "hello")
+    work = terminal.file("nav.yaml", APPLICATION)
+    with terminal.start("up", work, start_new_session=True) as process:
+        try:
+            said = read_until(process.stdout.fileno(), "nav is at version 1 with 1 process")
+            assert "nav is at version 1 with 1 process" in said, said + process.stderr.read()
+            assert "hello" in terminal.run("logs", "greeter")
+            os.killpg(process.pid, signal.SIGINT)
+            process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()  # without effect on one that has ended
 
 
 def test_nothing_is_left_after_a_kill(terminal, tmp_path) -> None:

@@ -30,7 +30,9 @@ def up(  # noqa: PLR0917 - an argument for each option
     ctx: typer.Context,
     files: Annotated[
         list[str] | None,
-        typer.Argument(metavar="WORK...", help="Work files to submit once the hosts are ready."),
+        typer.Argument(
+            metavar="WORK...", help="Work files to submit, or with `app` to apply, on these hosts."
+        ),
     ] = None,
     hosts: Annotated[
         int,
@@ -78,7 +80,8 @@ def up(  # noqa: PLR0917 - an argument for each option
     """
     from rosrm.cli.up import session, slices
     from rosrm.cli.up.cluster import UpCluster, cleaned
-    from rosrm.config.work import load_work
+    from rosrm.config.documents import read
+    from rosrm.config.work import checked_work
     from rosrm.extensions.registry import Registry
 
     registry = Registry.discover()
@@ -86,7 +89,7 @@ def up(  # noqa: PLR0917 - an argument for each option
     file = config or ctx.ensure_object(CommonOptions).cluster
     settings = _settings(file, registry)
     ros = with_domain(_local(settings.ros, discovery), ctx, domain)
-    specs = [spec for name in files or [] for spec in load_work(name, registry)]
+    work = [checked_work(read(name), name, registry) for name in files or []]
     directory = (state or Path(tempfile.mkdtemp(prefix="rosrm-up-"))).absolute()
     with cleaned(directory, keep=state is not None):
         cluster = UpCluster(
@@ -95,7 +98,7 @@ def up(  # noqa: PLR0917 - an argument for each option
             files={"master": file.absolute()} if file else {},
             joining=ros, ends_with_starter=True,
         )  # fmt: skip
-        session.serve(cluster, specs)
+        session.serve(cluster, work)
 
 
 def _settings(file: Path | None, registry: Registry) -> ClusterConfig:

@@ -6,6 +6,7 @@ import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
@@ -17,6 +18,7 @@ from rosrm.cli.process import INTERRUPTED
 from rosrm.cli.up.cluster import UpCluster
 from rosrm.client.waiting import ENDED
 from rosrm.errors import NoMaster, RosrmError
+from rosrm.model.applications import Target
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow
 from rosrm.model.values import ProcessSpec
@@ -42,7 +44,9 @@ _SHOWN: Final = frozenset({
     EventKind.CHECKPOINT_FAILED, EventKind.RESTORED, EventKind.RESTORE_FAILED,
     EventKind.PEER_REFUSED, EventKind.JOURNAL_BACK, EventKind.JOURNAL_BEHIND,
     EventKind.SETTINGS_RELOADED, EventKind.RELOAD_REFUSED, EventKind.PLUGIN_FAILED,
-    EventKind.PLUGIN_WORKS,
+    EventKind.PLUGIN_WORKS, EventKind.APPLICATION_APPLIED, EventKind.APPLICATION_FAILED,
+    EventKind.APPLICATION_RETURNS, EventKind.APPLICATION_CANCELLED, EventKind.MODE_BEGINS,
+    EventKind.MODE_REACHED, EventKind.MODE_FAILED,
 })  # fmt: skip
 
 
@@ -54,17 +58,20 @@ class _Hurried(BaseException):
     """A second signal asks for the end at once."""
 
 
-def serve(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
-    """Start a cluster, submit processes, and show events until a signal; then end the cluster.
+def serve(cluster: UpCluster, work: Sequence[Target]) -> None:
+    """Start a cluster, start work, and show events until a signal; then end the cluster.
+
+    Args:
+        work: applications, and processes of none.
 
     Raises:
         typer.Exit: a second signal has killed the cluster.
-        RosrmError: a part was refused or has ended, or the processes were refused.
+        RosrmError: a part was refused or has ended, or the work was refused.
     """
     with _Signals() as signals:
         try:
             try:
-                _run(cluster, specs)
+                _run(cluster, work)
             except _Stopped:
                 _say("ending: the processes stop first; Ctrl-C again kills everything at once")
             except RosrmError as error:
@@ -104,11 +111,15 @@ class _Signals:
             raise self._next.pop(0)
 
 
-def _run(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
+def _run(cluster: UpCluster, work: Sequence[Target]) -> None:
     cluster.start()
     _say(_ready(cluster))
     after = cluster.client.list().last_sequence
-    _submit(cluster, specs)
+    work = [replace(one, specs=tuple(_sent(cluster, one.specs))) for one in work]
+    _submit(cluster, [spec for one in work if not one.application for spec in one.specs])
+    applications = [one for one in work if one.application]
+    if applications:
+        _say(cluster.client.apply(applications).message)
     while True:
         cluster.check_parts()
         for event in _new_events(cluster, after):
@@ -135,6 +146,15 @@ def _share(resource: str, size: float) -> str:
     if resource == "cpu":
         return f"{size:.3g} {'core' if size == 1.0 else 'cores'}"
     return f"{amount(size, 'B')} of {resource}"
+
+
+def _sent(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> Sequence[ProcessSpec]:
+    """Send the contents of artifacts to the master; return the specs with the digests."""
+    if not any(one.source for spec in specs for one in spec.artifacts):
+        return specs
+    from rosrm.client.artifacts import send_artifacts  # noqa: PLC0415 - only for artifacts
+
+    return send_artifacts(cluster.client, specs, _say)
 
 
 def _submit(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
