@@ -108,8 +108,10 @@ def with_changes_in_place(
 ) -> ProcessSpec:
     """Return the spec of a process with those fields of the desired one that need no new start."""
     spec = process.spec
-    if _needs_no_start(state, process, changed_fields(spec, desired), desired):
-        return desired
+    if spec.limits != desired.limits:
+        changed = changed_fields(spec, desired)
+        if _needs_no_start(state, process, changed, desired):
+            return desired
     if _in_place_of(spec) == _in_place_of(desired):
         return spec
     return replace(spec, **{name: getattr(desired, name) for name in IN_PLACE})
