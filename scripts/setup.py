@@ -34,7 +34,7 @@ CRIU = VENV / "criu"  # the same path as in tests/conftest.py and the Makefile
 INSTALL_CRIU = ROOT / "scripts" / "install_criu.sh"
 LOG = VENV / "setup.log"
 STAMP = VENV / "rosrm-setup.json"
-#: Packages of ROS interfaces, and what is said of each.
+#: Packages of ROS interfaces, and the title of the step that builds each.
 INTERFACES = {
     ROOT / "rosrm_msgs": "the ROS interfaces: generated and compiled, about a minute",
     ROOT / "composition_interfaces": "the services of component containers: the same, half as long",

@@ -123,7 +123,7 @@ def test_a_second_component_of_one_name_is_refused(loader: Loader) -> None:
 
 
 def test_a_signal_ends_a_container(loader: Loader) -> None:
-    """It is a usual end, without a traceback."""
+    """SIGINT is a usual end, without a traceback."""
     loader.load("Talker")
     loader.process.send_signal(signal.SIGINT)
     assert loader.process.wait(PATIENCE) == 0
