@@ -18,7 +18,7 @@ from rosrm.core.master.state.process import Image, LeftBehind
 from rosrm.core.slave.watches import Awaited, Memo, Watch
 from rosrm.core.supervisor import events as told
 from rosrm.core.supervisor.instance import Instance
-from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
+from rosrm.core.supervisor.rules import FenceRule, RestartRule, RunLimits, StopRule
 from rosrm.errors import CriuError, PortableError, TransferError
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.plan import Commit, Execute, Plan, Start, Stop
@@ -102,7 +102,7 @@ ORDERS = [
     ),
     told.StopOrdered(KEY), told.FenceOrdered(KEY), told.ContactReported(1.0, 2.0),
     told.RestartOrdered(KEY), told.FailOrdered(KEY, 7, "ill"),
-    messages.Amend(told.AmendOrdered(KEY, RestartRule()), {"A": "b"}),
+    messages.Amend(KEY, RestartRule(), {"A": "b"}, RunLimits(1e9, 0.0, 1.0, required=True)),
     messages.Remember(KEY, "memo"), messages.Forget((told.StatusStored(KEY),)),
     told.ShutdownOrdered(),
 ]  # fmt: skip

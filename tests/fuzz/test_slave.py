@@ -89,6 +89,7 @@ RULES: dict[str, Any] = {
     "kill": st.booleans(), "transient": st.booleans(), "leftovers": st.booleans(),
     "restart": st.builds(RestartRule, WHEN, SECONDS, SECONDS, SECONDS, NUMBERS, SECONDS),
     "stop": st.builds(StopRule, SECONDS, SECONDS),
+    "held": st.none() | st.lists(texts, max_size=3).map(tuple),
     "fence": st.none() | st.builds(FenceRule, SECONDS, SECONDS, st.booleans()),
 }  # fmt: skip
 SUPERVISOR_EVENTS = st.one_of(
