@@ -25,7 +25,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 try:
-    from composition_interfaces import srv
+    from composition_interfaces.srv import ListNodes, LoadNode, UnloadNode
 except ModuleNotFoundError as missing:
     raise SystemExit(
         "rosrm container: the ROS package composition_interfaces is missing. Install "
@@ -51,9 +51,9 @@ class Container:
         self._components: dict[int, Node] = {}
         self._newest = 0
         executor.add_node(self.node)
-        self.node.create_service(srv.LoadNode, f"{_SERVICES}/load_node", self._load)
-        self.node.create_service(srv.UnloadNode, f"{_SERVICES}/unload_node", self._unload)
-        self.node.create_service(srv.ListNodes, f"{_SERVICES}/list_nodes", self._list)
+        self.node.create_service(LoadNode, f"{_SERVICES}/load_node", self._load)
+        self.node.create_service(UnloadNode, f"{_SERVICES}/unload_node", self._unload)
+        self.node.create_service(ListNodes, f"{_SERVICES}/list_nodes", self._list)
 
     def close(self) -> None:
         """Destroy all nodes."""

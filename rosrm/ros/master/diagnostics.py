@@ -16,7 +16,11 @@ _log = logging.getLogger("rosrm.master")
 def open_diagnostics(participant: Participant) -> Callable[[Sequence[Diagnostic]], None] | None:
     """Return a function that publishes statuses; None: this ROS installation has no messages."""
     try:
-        from diagnostic_msgs import msg  # noqa: PLC0415 - not in every ROS installation
+        from diagnostic_msgs.msg import (  # noqa: PLC0415 - not in every ROS installation
+            DiagnosticArray,
+            DiagnosticStatus,
+            KeyValue,
+        )
     except ImportError as fault:
         _log.warning(
             "%s is not published: %s. Install the ROS package diagnostic_msgs, or set "
@@ -24,17 +28,17 @@ def open_diagnostics(participant: Participant) -> Callable[[Sequence[Diagnostic]
         )  # fmt: skip
         return None
     node = participant.node
-    publisher = node.create_publisher(msg.DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
+    publisher = node.create_publisher(DiagnosticArray, names.DIAGNOSTICS, qos.DIAGNOSTICS)
 
-    def status_of(one: Diagnostic) -> msg.DiagnosticStatus:
-        return msg.DiagnosticStatus(
+    def status_of(one: Diagnostic) -> DiagnosticStatus:
+        return DiagnosticStatus(
             level=bytes([one.level]), name=f"rosrm: {' '.join(one.subject)}",
             message=_text(one.message), hardware_id=one.host,
-            values=[msg.KeyValue(key=key, value=_text(text)) for key, text in one.values.items()],
+            values=[KeyValue(key=key, value=_text(text)) for key, text in one.values.items()],
         )  # fmt: skip
 
     def send(statuses: Sequence[Diagnostic]) -> None:
-        message = msg.DiagnosticArray(status=[status_of(one) for one in statuses])
+        message = DiagnosticArray(status=[status_of(one) for one in statuses])
         message.header.stamp = node.get_clock().now().to_msg()
         publisher.publish(message)
 

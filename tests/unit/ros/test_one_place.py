@@ -14,13 +14,15 @@ MAKERS = {
 SAFE = {"Sealed", "msg.Sealed", "msg.SealedReading", "msg.Signed", "srv.Sealed"}
 #: Modules that make entities of types that they do not name, with the reason.
 OTHER_TYPES = {
+    "node/container.py": "the services of containers in ROS 2",
     "node/managed_node.py": "the types of the user's node",
     "node/migratable.py": "the types of the user's node",
+    "ros/master/diagnostics.py": "`/diagnostics`, which tools of ROS 2 read",
     "ros/participant.py": "`serve`, which sealed.py alone calls",
     "ros/polling.py": "the types of its callers",
     "ros/slave/flows.py": "topics of applications",
     "ros/slave/health.py": "topics and services of applications",
-    "ros/slave/lifecycle_nodes.py": "services of applications",
+    "ros/slave/instance_clients.py": "services of applications",
     "ros/slave/publisher_watch.py": "topics of applications",
 }
 
