@@ -149,19 +149,6 @@ class HealthInFile:
 
 
 @dataclass(frozen=True, slots=True)
-class ComponentInFile:
-    """A node that a component container loads into its process."""
-
-    plugin: str
-    name: str
-    package: str = ""
-    namespace: str = ""
-    parameters: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
-    remappings: Mapping[str, str] = field(default_factory=lambda: EMPTY)
-    arguments: Mapping[str, Any] = field(default_factory=lambda: EMPTY)
-
-
-@dataclass(frozen=True, slots=True)
 class LifecycleInFile:
     """State to which a host brings a lifecycle node."""
 
@@ -304,7 +291,7 @@ class ProcessInFile:
     standby: StandbyInFile = field(default_factory=lambda: StandbyInFile(wanted=False))
     health: HealthInFile | None = None
     lifecycle: LifecycleInFile | None = None
-    components: tuple[ComponentInFile, ...] = ()
+    components: tuple[Component, ...] = ()
     near: tuple[NeighboursInFile, ...] = ()
     apart: tuple[NeighboursInFile, ...] = ()
     spread: SpreadInFile | None = None
@@ -362,8 +349,7 @@ class ProcessInFile:
             if self.lifecycle is None
             else _same(LifecyclePolicy, self.lifecycle),
             components=tuple(
-                _same(Component, one, parameters=dict(flattened(one.parameters)))
-                for one in self.components
+                replace(one, parameters=dict(flattened(one.parameters))) for one in self.components
             ),
             neighbours=tuple(self._neighbour_rules()),
             reschedule=_same(ReschedulePolicy, self.reschedule),

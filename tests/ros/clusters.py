@@ -11,7 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config.settings import ClusterConfig, HostConfig, LivenessSettings
+from rosrm.config.settings import (
+    ClusterConfig,
+    HostConfig,
+    LivenessSettings,
+    MigrationSettings,
+    ProcessDefaults,
+)
 from rosrm.errors import Refused
 from rosrm.model.rows import Listing, ProcessRow
 from rosrm.model.values import Kind, ProcessSpec, Readiness, StopPolicy
@@ -330,6 +336,15 @@ def wait_until_none(directory: Path, timeout: float = PATIENCE) -> dict[int, str
 
 
 Make = Callable[..., Cluster]
+
+
+def left_and_right(make: Make) -> Cluster:
+    """Return a cluster of two hosts, without automatic migration."""
+    return make(
+        host("left"), host("right"),
+        migration=MigrationSettings(automatic=False),
+        defaults=ProcessDefaults(needs={"memory": MIB}),
+    )  # fmt: skip
 
 
 @contextlib.contextmanager

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.config.settings import MigrationSettings, ProcessDefaults
 from rosrm.model.values import LifecyclePolicy, MigrationPolicy, ProcessSpec, RestartPolicy
-from tests.ros.clusters import MIB, SPIN, alive, host, node
+from tests.ros.clusters import SPIN, alive, left_and_right, node
 from tests.waiting import PATIENCE, wait_gone
 
 AGAIN = RestartPolicy("on-failure", delay=0.2)
@@ -65,12 +64,7 @@ node = Managed()
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """Yield a cluster of two hosts, without automatic migration."""
-    return make_shared(
-        host("left"), host("right"),
-        migration=MigrationSettings(automatic=False),
-        defaults=ProcessDefaults(needs={"memory": MIB}),
-    )  # fmt: skip
+    return left_and_right(make_shared)
 
 
 def managed(name: str, autostart="active", timeout: float = PATIENCE, **options) -> ProcessSpec:

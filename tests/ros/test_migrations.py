@@ -17,6 +17,7 @@ from tests.ros.clusters import (
     STEADY,
     alive,
     host,
+    left_and_right,
     node,
     python,
     service,
@@ -29,12 +30,7 @@ STOPS_FIRST = MigrationPolicy("relaunch", overlap=False)
 
 @pytest.fixture(scope="module")
 def cluster(make_shared):
-    """Yield a cluster of two hosts, without automatic migration."""
-    return make_shared(
-        host("left"), host("right"),
-        migration=MigrationSettings(automatic=False),
-        defaults=ProcessDefaults(needs={"memory": MIB}),
-    )  # fmt: skip
+    return left_and_right(make_shared)
 
 
 def other(name: str) -> str:

@@ -35,7 +35,7 @@ def begin(held: HeldInstance, loads: LoadedComponents, now: float) -> Step:
     return _list(held, loads)
 
 
-def listed(held: HeldInstance, event: events.ComponentsListed) -> Step:
+def listed(held: HeldInstance, event: events.ComponentsListed, _now: float) -> Step:
     """Load the next component that is missing in the list; without one the work is done."""
     loading, loads = held.loading, held.loads
     if loading is None or loads is None or loading.current is not None:

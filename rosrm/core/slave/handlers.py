@@ -31,6 +31,7 @@ _TOMBSTONES: Final = 10_000
 _RUNS: Final = (InstanceState.RUNNING, InstanceState.READY)
 
 _Commands = list[commands.Command]
+_Handler = Callable[[SlaveState, Any, float], _Commands]
 
 
 def _registered(state: SlaveState, event: events.Registered, now: float) -> _Commands:
@@ -363,34 +364,16 @@ def _ready(state: SlaveState, held: HeldInstance, awaited: Awaited, now: float) 
     ]  # fmt: skip
 
 
-def _state_read(state: SlaveState, event: events.LifecycleStateRead, now: float) -> _Commands:
-    held = state.held.get(event.instance)
-    if held is None or held.status.pid != event.pid:
-        return []
-    return _after(state, held, lifecycle_nodes.state_read(held, event, now), now)
+def _answered(advance: Callable[[HeldInstance, Any, float], Step]) -> _Handler:
+    """Return the handler of an answer of a node, which counts only for the run that was asked."""
 
+    def handler(state: SlaveState, event: Any, now: float) -> _Commands:
+        held = state.held.get(event.instance)
+        if held is None or held.status.pid != event.pid:
+            return []
+        return _after(state, held, advance(held, event, now), now)
 
-def _transition_answered(
-    state: SlaveState, event: events.TransitionAnswered, now: float
-) -> _Commands:
-    held = state.held.get(event.instance)
-    if held is None or held.status.pid != event.pid:
-        return []
-    return _after(state, held, lifecycle_nodes.transition_answered(held, event, now), now)
-
-
-def _components_listed(state: SlaveState, event: events.ComponentsListed, now: float) -> _Commands:
-    held = state.held.get(event.instance)
-    if held is None or held.status.pid != event.pid:
-        return []
-    return _after(state, held, components.listed(held, event), now)
-
-
-def _component_loaded(state: SlaveState, event: events.ComponentLoaded, now: float) -> _Commands:
-    held = state.held.get(event.instance)
-    if held is None or held.status.pid != event.pid:
-        return []
-    return _after(state, held, components.loaded(held, event, now), now)
+    return handler
 
 
 def _after(state: SlaveState, held: HeldInstance, step: Step, now: float) -> _Commands:
@@ -480,8 +463,6 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
     return orders
 
 
-_Handler = Callable[[SlaveState, Any, float], _Commands]
-
 #: Handler of each event.
 HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
     {
@@ -501,10 +482,10 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.SupervisorReplaced: _supervisor_replaced,
         events.SeenInGraph: _seen,
         events.LifecycleOrdered: _lifecycle_ordered,
-        events.LifecycleStateRead: _state_read,
-        events.TransitionAnswered: _transition_answered,
-        events.ComponentsListed: _components_listed,
-        events.ComponentLoaded: _component_loaded,
+        events.LifecycleStateRead: _answered(lifecycle_nodes.state_read),
+        events.TransitionAnswered: _answered(lifecycle_nodes.transition_answered),
+        events.ComponentsListed: _answered(components.listed),
+        events.ComponentLoaded: _answered(components.loaded),
         events.LookedAt: _looked_at,
         events.DevicesMissed: _devices_missed,
         events.TimePassed: _time_passed,

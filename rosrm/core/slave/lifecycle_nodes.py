@@ -113,7 +113,7 @@ def transition_answered(held: HeldInstance, event: events.TransitionAnswered, no
         return NOTHING
     if not event.succeeded:
         where = f" from the state {steering.state}" if steering.state else ""
-        return _fault(f"the lifecycle transition {event.transition}{where} failed in the node")
+        return Step(fault=f"the lifecycle transition {event.transition}{where} failed in the node")
     steering.state = STATE_AFTER[event.transition]
     return _arrived(held, steering, lifecycle, now)
 
@@ -124,7 +124,7 @@ def time_passed(held: HeldInstance, now: float) -> Step:
     if steering is None or lifecycle is None:
         return NOTHING
     if now >= steering.deadline:
-        return _fault(_time_out(steering, lifecycle))
+        return Step(fault=_time_out(steering, lifecycle))
     if now - steering.read_at < READ_PERIOD:
         return NOTHING
     steering.read_at = now
@@ -139,7 +139,7 @@ def _arrived(
     if steering.state == lifecycle.goal:
         return Step(reached=True)
     if steering.state == _FINAL:
-        return _fault(f"its lifecycle state is {_FINAL}; {lifecycle.goal} is required")
+        return Step(fault=f"its lifecycle state is {_FINAL}; {lifecycle.goal} is required")
     transition = _NEXT.get((steering.state, lifecycle.goal))
     if transition is None:  # the node is in a transition that it began itself
         return NOTHING
@@ -152,10 +152,6 @@ def _arrived(
 def _read(held: HeldInstance, lifecycle: ManagedLifecycle, now: float) -> Step:
     status = held.status
     return Step((commands.ReadLifecycleState(status.instance, status.pid, lifecycle, now),))
-
-
-def _fault(reason: str) -> Step:
-    return Step(fault=reason)
 
 
 def _time_out(steering: Steering, lifecycle: ManagedLifecycle) -> str:

@@ -61,7 +61,7 @@ def test_a_revert_without_a_version_to_return_to_says_so(rosrm, client):
     ids=["applied", "cancelled"],
 )
 def test_an_apply_that_another_request_replaces_says_so(rosrm, client, row, work):
-    """What runs is not what the file describes."""
+    """The running processes are not those of the file."""
     replaced = PlannedAction("p", Action.REPLACE, "nav", version=2)
     client.applications = [row]
     client.apply = lambda *_, **__: ApplyResult("nav version 2: 1 process to replace", (replaced,))

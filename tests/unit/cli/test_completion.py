@@ -19,7 +19,7 @@ from rosrm.errors import ConfigError, NoMaster
 
 @pytest.fixture
 def complete(client, monkeypatch):
-    """Return a function that completes the last word of a command line, with a fake master."""
+    """Return a function that completes a command line, with a fake master."""
     client.settings = []
     monkeypatch.setattr(client, "close", lambda: None)
     monkeypatch.setattr(type(client), "__enter__", lambda self: self, raising=False)

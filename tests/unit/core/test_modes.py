@@ -236,7 +236,7 @@ def test_a_host_that_stays_over_its_limit_is_no_new_condition_after_a_restart() 
 
 
 def test_moves_off_a_host_over_its_limit_do_not_begin_the_time_of_a_condition_again() -> None:
-    """A host from which processes are moved in vain needs the mode most."""
+    """A host that stays over its limit although processes are moved away needs the mode most."""
     parts = [movable(f"p{number}") for number in range(3)]
     degraded = replace(DOCKED, when=Trigger(over_limit="memory", lasts=5.0))
     cluster = Cluster("a", "b")

@@ -18,7 +18,7 @@ from rosrm.cli.commands import app
 from rosrm.config.cluster import load_cluster
 from rosrm.config.groups import GroupInFile
 from rosrm.config.host import load_host
-from rosrm.config.process import ComponentInFile, NeighboursInFile, ProcessInFile
+from rosrm.config.process import NeighboursInFile, ProcessInFile
 from rosrm.config.rollout import RolloutInFile
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.config.work import load_work
@@ -27,7 +27,7 @@ from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.discovery import HOOKS
 from rosrm.model import plan
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
-from rosrm.model.values import HostDescription
+from rosrm.model.values import Component, HostDescription
 from rosrm_checkpoint.other_host import OtherHostOptions
 from rosrm_criu.options import CriuOptions
 from rosrm_migration.handoff import HandoffOptions
@@ -127,7 +127,7 @@ def test_every_key_of_a_process_is_documented_and_nothing_else():
     wanted |= {"app", "rollout", *keys(RolloutInFile, "rollout.")}
     members = [field.name for field in fields(NeighboursInFile)]
     wanted |= {f"{key}.{member}" for key in ("near", "apart") for member in members}
-    wanted |= set(keys(ComponentInFile, "components."))
+    wanted |= set(keys(Component, "components."))
     assert rows(section(page("configuration.md"), "`work.yaml`")) == wanted
 
 
