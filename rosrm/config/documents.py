@@ -19,6 +19,8 @@ from rosrm.errors import ConfigError
 
 #: Highest number of values in one file; values behind an alias count at each use of the alias.
 MOST_VALUES: Final = 200_000
+#: Ends of the names of launch files of ROS 2 that are no YAML.
+_LAUNCH_FILES: Final = ("launch.py", "launch.xml")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -123,9 +125,17 @@ def _allowed_once(lines: Iterable[str]) -> Iterator[str]:
 def read(path: str | Path) -> Node:
     """Read a file; raises `ConfigError` with line and column if it is unreadable.
 
-    `-` is the standard input.
+    `-` is the standard input. A launch file of ROS 2 is refused.
     """
-    return parse(_text(Path(path)), str(path))
+    path = Path(path)
+    text = _text(path)
+    root = None if path.name.endswith(_LAUNCH_FILES) else parse(text, str(path))
+    if root is None or root.items.keys() == {"launch"}:
+        raise ConfigError(
+            f"{path}: this is a launch file of ROS 2; use `rosrm launch {path}` (distribution "
+            "rosrm-launch)"
+        )
+    return root
 
 
 def parse(text: str, file: str) -> Node:

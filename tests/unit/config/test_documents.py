@@ -6,6 +6,7 @@ import pytest
 
 from rosrm.config.documents import Place, parse, read
 from rosrm.errors import ConfigError
+from tests.launch_files import FILES
 
 
 def refusal(text: str) -> str:
@@ -46,6 +47,14 @@ def test_unreadable_yaml_is_refused_with_line_and_column():
     assert refusal("a: [1, 2\nb: 3\n").startswith("f.yaml:2:2: unreadable YAML: ")
     assert refusal("a: 'x\n").startswith("f.yaml:2:1: unreadable YAML: ")
     assert "f.yaml:1:4: unreadable YAML: the character #x0007" in refusal("a: \x07")
+
+
+@pytest.mark.parametrize("name", ["events.launch.py", "sensors.launch.xml", "tools.launch.yaml"])
+def test_a_launch_file_is_refused_with_the_command_that_runs_it(name):
+    """`rosrm apply`, `submit` and `up` get such files from users of `ros2 launch`."""
+    file = FILES / name
+    with pytest.raises(ConfigError, match=f"launch file of ROS 2; use `rosrm launch {file}`"):
+        read(file)
 
 
 def test_a_key_given_twice_is_refused_with_both_places():
