@@ -11,7 +11,7 @@ from rosrm.wording import get_close_matches
 #: Fields of a process in which placeholders stand.
 WITH_PLACEHOLDERS: Final = (
     "command", "prefix", "arguments", "parameters", "parameter_sources", "environment",
-    "working_directory",
+    "working_directory", "components",
 )  # fmt: skip
 #: Name of the directory with the artifacts of the process.
 ARTIFACTS: Final = "artifacts"

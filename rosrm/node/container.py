@@ -11,6 +11,7 @@ constructor passes its keyword arguments on to rclpy's `Node`:
 
 from __future__ import annotations
 
+import gc
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -66,7 +67,9 @@ class Container:
             node = self._made(request)
         except Exception as error:  # noqa: BLE001 - whatever the component raises is its answer
             response.error_message = f"{request.plugin_name}: {type(error).__name__}: {error}"
+        if response.error_message:
             self.node.get_logger().error(f"cannot load {response.error_message}")
+            gc.collect()  # a node whose constructor raised is in the graph until it is freed
             return response
         self._newest += 1
         self._components[self._newest] = node

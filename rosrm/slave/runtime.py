@@ -12,7 +12,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,6 +34,7 @@ from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Amendment,
+    Component,
     HostDescription,
     InstanceId,
     InstanceState,
@@ -65,8 +65,8 @@ from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
 from rosrm.slave.interfaces import own_address
 from rosrm.slave.launch.ament_index import search_path
+from rosrm.slave.launch.components import filled_component
 from rosrm.slave.launch.launchers import Launchers
-from rosrm.slave.launch.packages import component_with_packages
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
@@ -161,9 +161,8 @@ class SlaveRuntime:
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._clients = InstanceClients(self._participant)
             self._lifecycle_clients = LifecycleClients(self._clients, self._take)
-            prefixes = search_path(os.environ, sys.executable)
-            located = partial(component_with_packages, prefixes=prefixes)
-            self._component_loads = ComponentLoads(self._clients, self._take, located)
+            self._prefixes = search_path(os.environ, sys.executable)
+            self._component_loads = ComponentLoads(self._clients, self._take, self._filled)
             self._note_probes(first)
             self._note_broken(offered.broken)
             name = f"{self._participant.node.get_name()}_flows"
@@ -539,6 +538,13 @@ class SlaveRuntime:
         if isinstance(command, commands.Restart):  # on request of a user
             self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
+
+    def _filled(self, container: InstanceId, component: Component) -> Component:
+        """Return a component with the values of its placeholders; raises `LaunchError`."""
+        return filled_component(
+            component, self._state.held[container], devices=self._devices.devices,
+            artifacts=self._artifacts.root, prefixes=self._prefixes,
+        )  # fmt: skip
 
     def _follow_session(self, status: InstanceStatus) -> None:
         self._usage.follow(status)

@@ -114,6 +114,17 @@ def test_a_component_that_cannot_be_loaded_is_refused_with_the_reason(
     assert loader.names() == before
 
 
+def test_a_node_whose_constructor_raises_leaves_the_graph(loader: Loader) -> None:
+    """A second try would otherwise find a node of the same name."""
+    refused = loader.load("Half", node_name="half")
+    assert "OSError: no device here" in refused.error_message
+    later = loader.load("Talker", node_name="later")
+    names = loader.participant.node.get_node_names
+    wait_until(lambda: "later" in names(), "the node that was loaded after it is in the graph")
+    assert "half" not in names()
+    loader.ask("UnloadNode", "unload_node", unique_id=later.unique_id)
+
+
 def test_a_second_component_of_one_name_is_refused(loader: Loader) -> None:
     """Two nodes of one name would disturb each other."""
     first = loader.load("Talker", node_name="one")

@@ -14,7 +14,7 @@ from rosrm.core.master.checkpoint import image_requests
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
 from rosrm.core.master.dependants import dependants_first
-from rosrm.core.master.graph_names import shared_nodes
+from rosrm.core.master.graph_names import node_of, shared_nodes
 from rosrm.core.master.hosts.registration import save_host
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import departures, try_move
@@ -196,7 +196,23 @@ def submission_fault(
         fault = _spec_fault(state, spec)
         if fault:
             return f"{spec.name}: {fault}{_origin(defaulted)}"
-    return ""
+    return _shared_container(state, [spec for spec, _ in submitted if spec.components])
+
+
+def _shared_container(state: MasterState, submitted: Sequence[ProcessSpec]) -> str:
+    """Return a sentence on containers of one name; "": there are none.
+
+    In DDS each of them would execute a request to load a component.
+    """
+    if not submitted:
+        return ""
+    own = {spec.name for spec in submitted}
+    others = (
+        (one.name, one.node) for one in state.processes.values()
+        if one.spec.components and one.name not in own and not one.phase.is_terminal
+    )  # fmt: skip
+    shared = shared_nodes([*((spec.name, node_of(spec)) for spec in submitted), *others])
+    return f"two containers would load the same components: {shared[0]}" if shared else ""
 
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:

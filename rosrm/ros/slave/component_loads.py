@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rosrm.core.slave import events
 from rosrm.core.slave.commands import ListComponents, LoadComponent
 from rosrm.errors import LaunchError
-from rosrm.model.values import Component
+from rosrm.model.values import Component, InstanceId
 from rosrm.ros.slave.instance_clients import InstanceClients
 
 #: Seconds after which a request for a list counts as lost; the core repeats it.
@@ -28,17 +28,17 @@ class ComponentLoads:
 
     Args:
         take: takes events for the core.
-        located: returns a component with the directories of packages on this host in its
-            parameters; raises `LaunchError`.
+        filled: returns a component of an instance with the values of its placeholders on this
+            host; raises `LaunchError`.
     """
 
     def __init__(
         self, clients: InstanceClients, take: Callable[[events.Event], None],
-        located: Callable[[Component], Component],
+        filled: Callable[[InstanceId, Component], Component],
     ) -> None:  # fmt: skip
         self._clients = clients
         self._take = take
-        self._located = located
+        self._filled = filled
 
     def send(self, request: ListComponents | LoadComponent, now: float) -> None:
         """Send a request to a container; its answer becomes an event."""
@@ -81,7 +81,7 @@ class ComponentLoads:
         """Order a container to load a component, however long its constructor takes."""
         instance, pid, component = request.instance, request.pid, request.component
         try:
-            located = self._located(component)
+            filled = self._filled(instance, component)
         except LaunchError as error:
             self._take(events.ComponentLoaded(instance, pid, component, str(error)))
             return
@@ -94,7 +94,7 @@ class ComponentLoads:
             fault = "" if response.success else response.error_message or unsaid
             self._take(events.ComponentLoaded(instance, pid, component, fault))
 
-        self._clients.call(client, load_request(srv, located), inf, answered)
+        self._clients.call(client, load_request(srv, filled), inf, answered)
 
 
 def load_request(srv: Any, component: Component) -> Any:

@@ -4,22 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
 from rosrm.errors import LaunchError
-from rosrm.model.values import Component, ProcessSpec
+from rosrm.model.values import ProcessSpec
 from rosrm.slave.launch.ament_index import find_package
 from rosrm.slave.launch.placeholders import with_texts
 
 _REFERENCE: Final = re.compile(r"\$\(find-pkg-(share|prefix) +([A-Za-z0-9_.-]+)\)")
-
-
-def component_with_packages(component: Component, prefixes: Sequence[Path]) -> Component:
-    """Return a component with the directories in its parameters; raises `LaunchError`."""
-    spec = with_packages(ProcessSpec("", parameters=component.parameters), prefixes)
-    return replace(component, parameters=spec.parameters)
 
 
 def with_packages(spec: ProcessSpec, prefixes: Sequence[Path]) -> ProcessSpec:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Any
 
 from rosrm.model.placeholders import PLACEHOLDER, WITH_PLACEHOLDERS
-from rosrm.model.values import Assignment, ParameterSource, ProcessSpec
+from rosrm.model.values import Assignment, Component, ParameterSource, ProcessSpec
 
 
 def filled(assignment: Assignment, values: Mapping[str, str]) -> Assignment:
@@ -40,4 +40,7 @@ def _changed(value: Any, change: Callable[[str], str]) -> Any:
     if isinstance(value, ParameterSource):
         parameters = _changed(value.parameters, change)
         return replace(value, file=change(value.file), parameters=parameters)
+    if isinstance(value, Component):
+        parameters = _changed(value.parameters, change)
+        return replace(value, parameters=parameters, arguments=_changed(value.arguments, change))
     return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from typing import Any
 
 from rclpy.node import Node
@@ -26,6 +27,21 @@ class Broken(Node):
         super().__init__("broken", **options)
         self.destroy_node()
         raise OSError("no device here")
+
+
+class Half(Node):
+    """Has a timer, which refers to the node, when its constructor raises.
+
+    Python collects unused nodes at any time; from now on only if the container asks for it.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("half", **options)
+        self.create_timer(1.0, self.tick)
+        gc.disable()
+        raise OSError("no device here")
+
+    def tick(self) -> None: ...
 
 
 class Plain:

@@ -123,6 +123,18 @@ def test_a_misspelt_placeholder_is_refused(refusal, key, word, said):
     assert said in refusal(load_work, text)
 
 
+def test_a_misspelt_placeholder_of_a_component_is_refused(refusal):
+    """Otherwise the placeholder would reach the component as text."""
+    text = """
+        processes:
+          - {name: a, module: m, ros: true, devices: {camera: 1}, components: [
+              {plugin: p, name: c, parameters: {source: "{device.camera}", map: "{artifacts}/m"}}]}
+        """
+    said = refusal(load_work, text)
+    assert "components: {artifacts} needs `artifacts:` in the process" in said
+    assert "{device.camera}" not in said
+
+
 def test_other_braces_are_no_placeholders(file):
     """Shells, awk and formats of Python use braces, too."""
     words = ["{print $1}", "${HOME}", "{device}", "{x.y}", '{"artifact": 1}', "{}"]

@@ -11,6 +11,7 @@ from rosrm.model.orders import StartInstance, StopInstance
 from rosrm.model.plan import Move, Plan
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
+    Component,
     InstanceId,
     InstanceState,
     InstanceStatus,
@@ -112,6 +113,22 @@ def test_a_submission_warns_of_two_nodes_of_one_name() -> None:
     run = {"command": ("ros2", "run", "demo_nodes_cpp", "talker")}
     reply = cluster.submit(process("one", **run), process("two", **run))
     assert "one and two put the default node of demo_nodes_cpp talker into" in reply.message
+
+
+def test_two_containers_of_one_name_are_refused() -> None:
+    """Both would execute each request to load a component; a terminal one does no harm."""
+    cluster = Cluster("a")
+
+    def box(name: str, *components: Component) -> ProcessSpec:
+        return node(name, node_name="box", components=components or (Component("p", "c"),))
+
+    said = "two containers would load the same components: one and two put the node /box into"
+    assert said in cluster.submit(box("one"), box("two")).message
+    cluster.submit(box("one"))
+    assert "two and one put the node /box into" in cluster.submit(box("two")).message
+    cluster.cancel("one")
+    cluster.settle()
+    assert cluster.submit(box("two")).message == "1 process queued"
 
 
 def test_a_strategy_may_refuse_a_spec_before_it_is_queued() -> None:

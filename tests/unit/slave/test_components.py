@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import pytest
+
+from rosrm.artifacts.cache import set_directory
 from rosrm.core.slave.commands import Fail, ListComponents, LoadComponent, Stop
 from rosrm.core.slave.components import LIST_PERIOD
 from rosrm.core.slave.events import (
@@ -11,6 +16,10 @@ from rosrm.core.slave.events import (
     SupervisorReplaced,
     TimePassed,
 )
+from rosrm.core.slave.state import HeldInstance
+from rosrm.errors import LaunchError
+from rosrm.model.artifacts import Artifact
+from rosrm.model.devices import Device, HeldDevice
 from rosrm.model.values import (
     Component,
     InstanceId,
@@ -19,6 +28,7 @@ from rosrm.model.values import (
     ProcessSpec,
     Readiness,
 )
+from rosrm.slave.launch.components import filled_component
 from rosrm.slave.memos import from_memo, to_memo
 from tests.unit.slave.rig import Slave, states
 
@@ -125,3 +135,26 @@ def test_the_next_run_gets_all_components_again() -> None:
         assert one.step(SeenInGraph(C)) == [ListComponents(C, 6, "/robot/c/_container")]
         stale = one.step(ComponentsListed(C, PID, frozenset({"/left/camera", "/filter"})))
         assert stale == [], "the answer of the former run"
+
+
+def test_a_component_gets_the_devices_and_artifacts_of_its_container() -> None:
+    """They stand in its parameters and extra arguments; other texts and numbers stay."""
+    model, root = Artifact("model", "0" * 64, 5), Path("/cache")
+    status = InstanceStatus(C, InstanceState.RUNNING, PID)
+    held = HeldInstance(status, devices=(HeldDevice("camera", "front"),), artifacts=(model,))
+    component = Component(
+        "m:Camera", "{device.camera}", arguments={"log": "{device.camera}.log"},
+        parameters={"source": "{device.camera}", "models": ["{artifacts}/model"], "rate": 5},
+    )  # fmt: skip
+    front = Device("camera", "front", "/dev/video0")
+
+    def filled(*devices: Device) -> Component:
+        return filled_component(component, held, devices=devices, artifacts=root, prefixes=())
+
+    directory = set_directory(root, (model,))
+    assert filled(front) == Component(
+        "m:Camera", "{device.camera}", arguments={"log": "/dev/video0.log"},
+        parameters={"source": "/dev/video0", "models": [f"{directory}/model"], "rate": 5},
+    )  # fmt: skip
+    with pytest.raises(LaunchError, match="camera front is no device of this host now"):
+        filled()
