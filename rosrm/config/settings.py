@@ -241,6 +241,18 @@ class ControlSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class ApplicationSettings:
+    """Treatment of applications.
+
+    Attributes:
+        progress_deadline: seconds for which a service may wait for a host before the version of its
+            application fails; 0: no limit.
+    """
+
+    progress_deadline: Seconds = _CORE.progress_deadline
+
+
+@dataclass(frozen=True, slots=True)
 class NetworkSettings:
     """Measurement of links between hosts, and of flows between processes.
 
@@ -320,6 +332,7 @@ class ClusterConfig:
         defaults: default needs of processes.
         liveness: time limits for silent hosts.
         control: times of messages.
+        applications: treatment of applications.
         network: measurement of links and flows.
         journal: journal of events and intents.
         record: recording of all events that the master receives, for replay.
@@ -347,6 +360,7 @@ class ClusterConfig:
     defaults: ProcessDefaults = field(default_factory=ProcessDefaults)
     liveness: LivenessSettings = field(default_factory=LivenessSettings)
     control: ControlSettings = field(default_factory=ControlSettings)
+    applications: ApplicationSettings = field(default_factory=ApplicationSettings)
     network: NetworkSettings = field(default_factory=NetworkSettings)
     journal: JournalSettings = field(default_factory=JournalSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
@@ -390,6 +404,7 @@ class ClusterConfig:
             rebalance_after=self.rebalance.after,
             rebalance_moves=self.rebalance.max_moves,
             order_retry=self.control.order_retry,
+            progress_deadline=self.applications.progress_deadline,
             keep_ended=self.journal.keep_ended,
             keep_versions=self.journal.keep_versions,
             max_hosts=self.max_hosts,

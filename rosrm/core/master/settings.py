@@ -44,6 +44,8 @@ class CoreSettings:
         rebalance_after: seconds for which the difference must last, and between two rounds.
         rebalance_moves: most processes that move in one round.
         order_retry: seconds after which an unanswered order is repeated.
+        progress_deadline: seconds for which a service of an application may wait for a host before
+            its version fails; 0: no limit.
         keep_ended: number of the newest terminal processes that are not garbage-collected.
         keep_versions: number of the newest versions of each application that are kept.
         max_hosts: most hosts, also of those that left or are lost.
@@ -75,6 +77,7 @@ class CoreSettings:
     rebalance_after: float = 60.0
     rebalance_moves: int = 4
     order_retry: float = 2.0
+    progress_deadline: float = 600.0
     keep_ended: int = 10_000
     keep_versions: int = 5
     max_hosts: int = 2_000

@@ -86,9 +86,9 @@ __all__ = [
 # --- fixtures ---------------------------------------------------------------------------------
 
 
-def job(name: str, **fields: Any) -> ProcessSpec:
+def job(name: str, memory: float = 0.0, **fields: Any) -> ProcessSpec:
     """Return the spec of a process that runs to completion."""
-    return process(name, kind=Kind.JOB, **fields)
+    return process(name, memory, kind=Kind.JOB, **fields)
 
 
 def process(name: str, memory: float = 0.0, **fields: Any) -> ProcessSpec:

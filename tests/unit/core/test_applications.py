@@ -22,8 +22,9 @@ from rosrm.model.values import (
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    StartOrder,
 )
-from tests.unit.core.cluster import Cluster, Machine, job, movable, process
+from tests.unit.core.cluster import GIB, Cluster, Machine, job, movable, process
 from tests.unit.core.test_handoffs import stateful
 
 ADA, BOB = Requester("user:ada"), Requester("user:bob")
@@ -509,6 +510,107 @@ def test_a_first_version_has_nothing_to_return_to() -> None:
     cluster.wait(5.0)
     assert cluster.phase("q") == "running"
     assert state_of(cluster)[0] == 1
+
+
+def crowded(**settings: Any) -> Cluster:
+    """Return a cluster whose host has room for version 1 of p, but not for version 2 just now."""
+    cluster = Cluster("a", **settings).with_processes(process("x", 5_000))
+    cluster.apply("nav", process("p", 3_000))
+    cluster.wait(1.0)
+    return cluster
+
+
+@pytest.mark.parametrize("on_failure", ["return", "pause"])
+def test_a_version_whose_process_finds_no_room_is_given_up_after_a_time(on_failure: str) -> None:
+    """The old program runs again, or the application pauses; the record has time and reason."""
+    cluster = crowded(progress_deadline=30.0)
+    cluster.apply("nav", new(process("p", 8_000)), on_failure=on_failure)
+    cluster.wait(25.0)
+    follows = "version 1 returns" if on_failure == "return" else "the application is paused"
+    assert cluster.phase("p") == "queued"
+    assert row(cluster).pending["p"].endswith(f"; if this lasts 30 s, {follows}")
+    cluster.wait(10.0)
+    kind = "application_returns" if on_failure == "return" else "application_failed"
+    (message,) = cluster.recorded(kind)
+    assert "p: it has waited 30 s for a host: " in message
+    if on_failure == "return":
+        assert (program(cluster, "p"), state_of(cluster)) == (("run", "it"), (1, []))
+    else:
+        assert row(cluster).state == "paused"
+
+
+def test_a_stateful_process_that_finds_no_room_beside_it_is_given_up_after_a_time() -> None:
+    """Its old instance never stopped."""
+    cluster = Cluster("a", progress_deadline=30.0)
+    cluster.apply("nav", stateful("p", memory=8_000))
+    cluster.wait(1.0)
+    owner = cluster["p"].owner
+    cluster.apply("nav", new(stateful("p", memory=8_000)))
+    cluster.wait(35.0)
+    assert (cluster["p"].owner, state_of(cluster)) == (owner, (1, []))
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [job("q", 8_000), process("q", start_order=StartOrder({"w": "finished"}))],
+    ids=["a job", "a process that waits for another one"],
+)
+def test_what_may_wait_long_ends_no_version(spec: ProcessSpec) -> None:
+    """A queue of jobs is meant to be long, and the time of a dependency is its own."""
+    cluster = crowded(progress_deadline=5.0)
+    cluster.apply("nav", process("p", 3_000), job("w"), spec)
+    cluster.wait(20.0)
+    assert (row(cluster).state, state_of(cluster)) == ("applying", (2, ["q"]))
+
+
+def test_without_a_deadline_a_process_waits_for_room() -> None:
+    """It starts with the new version once there is room, however late."""
+    cluster = crowded(progress_deadline=0.0)
+    cluster.apply("nav", new(process("p", 8_000)))
+    cluster.wait(900.0, tick=1.0)
+    assert "if this lasts" not in row(cluster).pending["p"]
+    cluster.cancel("x")
+    cluster.wait(3.0)
+    assert (program(cluster, "p"), state_of(cluster)) == (("new",), (2, []))
+
+
+def test_a_short_wait_for_room_does_not_count_towards_the_next_one() -> None:
+    """The deadline is that of one wait."""
+    cluster = crowded(progress_deadline=30.0)
+    cluster.apply("nav", new(process("p", 8_000)), healthy_for=100.0)
+    cluster.wait(20.0)
+    cluster.cancel("x")
+    cluster.wait(3.0)
+    assert program(cluster, "p") == ("new",)
+    cluster.leave("a")
+    cluster.wait(20.0)
+    assert cluster.phase("p") == "queued"
+    assert state_of(cluster) == (2, ["p"])
+
+
+@pytest.mark.parametrize("why", ["set aside", "no room"])
+def test_a_first_version_is_degraded_by_a_process_without_a_host(why: str) -> None:
+    """`rosrm apply` ends then, and the process still starts once a host may take it."""
+    cluster = Cluster(Machine("a", memory=4 * GIB), progress_deadline=30.0)
+    cluster.with_processes(process("x", 1_500))
+    cluster.apply("nav", process("q"), process("p", 5_000 if why == "set aside" else 2_000))
+    cluster.wait(12.0 if why == "set aside" else 31.0)
+    assert (row(cluster).state, state_of(cluster)) == ("degraded", (1, []))
+    assert ("p is set aside: " if why == "set aside" else "p is queued: ") in row(cluster).reason
+    (message,) = cluster.recorded("application_failed")
+    assert message.startswith("nav is degraded: p: it ")
+    cluster.add(Machine("b"))
+    cluster.wait(3.0)
+    assert (row(cluster).state, cluster.phase("p")) == ("running", "running")
+
+
+def test_a_plan_shows_that_a_process_would_wait_and_not_what_follows_later() -> None:
+    """Its rounds are farther apart than the deadline."""
+    cluster = crowded(progress_deadline=5.0)
+    reply = cluster.apply("nav", new(process("p", 8_000)), healthy_for=60.0, plan=True)
+    (planned,) = reply.actions
+    assert (planned.action, bool(planned.waits)) == (Action.REPLACE, True)
+    assert "would return" not in reply.message
 
 
 # --- versions ---------------------------------------------------------------------------------

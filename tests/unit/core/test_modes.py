@@ -14,7 +14,7 @@ from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.modes import Mode, Trigger
 from rosrm.model.values import HostLossPolicy, ProcessSpec, StartOrder
-from tests.unit.core.cluster import Cluster, Eq1, Machine, movable, process
+from tests.unit.core.cluster import Cluster, Eq1, Machine, job, movable, process
 from tests.unit.core.test_applications import actions, new
 
 
@@ -161,6 +161,22 @@ def test_a_mode_whose_process_fails_is_left_again() -> None:
     assert failed.startswith("the mode docked is not reached, and exploring returns: charger ")
     (row,) = [one for one in mode_rows(cluster.state) if one.name == "docked"]
     assert row.reason.startswith("charger ")
+
+
+def test_a_mode_whose_process_finds_no_room_for_long_is_left_again() -> None:
+    """The plan found a host, but the room is taken before the process starts."""
+    late = process("charger", 8_000, start_order=StartOrder({"calibrate": "finished"}))
+    cluster = in_mode(
+        "exploring", EXPLORING, Mode("docked", (NAV, target("dock", job("calibrate"), late))),
+        cluster=Cluster("a", progress_deadline=20.0),
+    )  # fmt: skip
+    assert switch(cluster, "docked").accepted
+    cluster.with_processes(process("x", 10_000))
+    cluster.finish("calibrate")
+    cluster.wait(30.0)
+    assert states(cluster) == {"exploring": "in force", "docked": ""}
+    (failed,) = cluster.recorded("mode_failed")
+    assert "docked is not reached, and exploring returns: charger finds no host: " in failed
 
 
 def test_a_new_version_that_fails_ends_the_switch() -> None:

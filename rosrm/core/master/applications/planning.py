@@ -10,6 +10,7 @@ from typing import Any, Final
 from rosrm.core.master import lifecycle
 from rosrm.core.master.answers import order_answered
 from rosrm.core.master.applications import amendments, rollout
+from rosrm.core.master.applications.deadlines import awaits_host
 from rosrm.core.master.applications.difference import changed_fields
 from rosrm.core.master.commands import Assign, Command, PublishStateConfig, SendOrder
 from rosrm.core.master.consequences import follow_up
@@ -82,14 +83,11 @@ def _returns(before: MasterState, after: MasterState) -> Iterable[str]:
 
 def _without_host(state: MasterState, requested: Collection[str]) -> Iterable[str]:
     """Yield a phrase on each changed process that waits for a host, and not for other processes."""
-    awaiting = state.queue.awaiting
     for name in requested:
         application = state.applications.get(name)
         for task in application.tasks if application is not None else ():
             process = state.processes.get(task)
-            if process is None or process.phase not in WAITING or task in state.queue.arrays:
-                continue
-            if not any(member in awaiting for member in (task, *state.gangs.of(process))):
+            if process is not None and awaits_host(state, process):
                 yield f"{task} would wait: {process.reason}"
 
 
@@ -110,6 +108,7 @@ def copied(state: MasterState) -> MasterState:
     memo[id(state.rankings)], memo[id(state.demands)] = {}, {}
     memo.update((id(one.history), list(one.history)) for one in state.processes.values())
     copy = deepcopy(state, memo)
+    copy.settings = replace(state.settings, progress_deadline=0.0)  # a plan shows what waits
     copy.rankings_version = -1
     return copy
 

@@ -34,6 +34,10 @@ class NeverFits(Rejected):
     """No host that is known may ever take the new version of a process."""
 
 
+class Busy(Rejected):
+    """Other work must end first, which has its own time limits."""
+
+
 def try_replace(
     state: MasterState, process: Process, spec: ProcessSpec, cause: str, now: float
 ) -> Rejected | None:
@@ -44,7 +48,7 @@ def try_replace(
         cause: phrase for records.
     """
     if process.name in state.migrations:
-        return Rejected(why_busy(state.migrations[process.name]))
+        return Busy(why_busy(state.migrations[process.name]))
     kept = state.declared.capabilities_of(spec).state
     strategy = spec.migration.strategy
     can_move = strategy in state.strategies and kept != "memory"  # an image has the old program
@@ -55,7 +59,7 @@ def try_replace(
         _stop_and_start(state, process, spec, cause, now)
         return None
     if not may_begin(state, 1):
-        return Rejected("waits until another process has moved")
+        return Busy("waits until another process has moved")
     refusal = _migrate(state, process, spec, cause, now)
     if refusal is not None and kept == "none":
         _stop_and_start(state, process, spec, cause, now)
@@ -70,7 +74,7 @@ def _migrate(
     source = state.instances[process.owner]
     others = process.instances - {source.id.number}
     if others and process.name not in state.standbys:
-        return Rejected(f"an earlier instance of {process.name} is still being stopped")
+        return Busy(f"an earlier instance of {process.name} is still being stopped")
     excluded = {**process.forbidden_hosts, **unable(state, process, source.host.name)}
     ranking = ranking_of(state, _demand(state, process, spec, excluded))
     column = source.host.column if ranking.fits(source.host.column) else ranking.best()

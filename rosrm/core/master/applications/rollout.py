@@ -26,8 +26,13 @@ from dataclasses import replace
 from math import inf
 from typing import Final
 
+from rosrm.core.master.applications.deadlines import (
+    awaits_host,
+    is_set_aside_for_good,
+    note_wait,
+)
 from rosrm.core.master.applications.difference import differences, with_changes_in_place
-from rosrm.core.master.applications.replacement import NeverFits, try_replace
+from rosrm.core.master.applications.replacement import Busy, NeverFits, try_replace
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.dependants import dependants_first
@@ -64,7 +69,9 @@ def _review(state: MasterState, application: Application, now: float) -> None:
         if spec is None:
             done = _stop(state, application, name, now)
         else:
+            task.awaits_host = False
             done = _advance(state, application, task, spec, now, may_replace=replacing < most)
+            note_wait(state, application, task, spec, now)
             replacing += task.replaces and task.begun and not was_begun
         if done:
             _end(state, application, name)
@@ -203,7 +210,7 @@ def _replace(
         if isinstance(refusal, NeverFits):
             task.fault = refusal.reason
         if refusal is not None:
-            task.reason = refusal.reason
+            task.reason, task.awaits_host = refusal.reason, not isinstance(refusal, Busy)
             return
     else:
         task.reason = process.reason or f"it is {process.phase.value}"
@@ -221,7 +228,8 @@ def _runs_well(
         return process.name not in state.unamended
     task.reason = process.reason or f"it is {process.phase.value}"
     run, is_running = (process.owner, process.restarts), process.phase is ProcessPhase.RUNNING
-    if process.phase is ProcessPhase.SET_ASIDE and task.replaces and application.former:
+    task.awaits_host = awaits_host(state, process)
+    if is_set_aside_for_good(state, application, task, process, now):
         task.fault = f"it is set aside: {process.reason}"
     elif process.phase is ProcessPhase.BACKOFF or (run[0] == task.run[0] and run != task.run):
         why = process.reason.partition("; restart ")[0] or "it was restarted"

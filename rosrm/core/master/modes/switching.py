@@ -21,6 +21,7 @@ from math import inf
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import requests as applications
+from rosrm.core.master.applications.deadlines import has_waited_too_long
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.modes.settings import apply_settings, weighted
@@ -159,7 +160,7 @@ def review(state: MasterState, now: float) -> None:
 def _review_switch(state: MasterState, now: float) -> None:
     modes, mode = state.modes, state.modes.mode
     assert mode is not None
-    fault = next(_faults(state, mode), "")
+    fault = next(_faults(state, mode, now), "")
     if fault:
         _handle_fault(state, mode, fault, now)
     elif not any(one.tasks for name in modes.versions if (one := state.applications.get(name))):
@@ -169,7 +170,7 @@ def _review_switch(state: MasterState, now: float) -> None:
         state.record(now, EventKind.MODE_REACHED, text, facts={"mode": mode.name})
 
 
-def _faults(state: MasterState, mode: Mode) -> Iterator[str]:
+def _faults(state: MasterState, mode: Mode, now: float) -> Iterator[str]:
     """Yield why a mode cannot be reached; nothing: it still may."""
     for name in mode.applications:
         application = state.applications.get(name)
@@ -189,6 +190,8 @@ def _faults(state: MasterState, mode: Mode) -> Iterator[str]:
             known = state.processes.get(process)
             if known is not None and known.phase is ProcessPhase.FAILED:
                 yield f"{process} has failed: {known.reason}"
+            elif known is not None and has_waited_too_long(state, known, now):
+                yield f"{process} finds no host: {known.reason}"
 
 
 def _handle_fault(state: MasterState, mode: Mode, fault: str, now: float) -> None:

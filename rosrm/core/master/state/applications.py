@@ -46,6 +46,8 @@ class Task:
         reason: why it is not done yet.
         run: number of the owning instance and its restarts when the process began to run well.
         well_since: start of that run by this master's clock; inf: it does not run well.
+        awaits_host: the process finds no host for now.
+        awaits_since: start of that wait by this master's clock; inf: it finds one, or runs.
     """
 
     replaces: bool = False
@@ -54,6 +56,8 @@ class Task:
     reason: str = ""
     run: tuple[int, int] = (0, 0)
     well_since: float = inf
+    awaits_host: bool = False
+    awaits_since: float = inf
 
 
 @dataclass(slots=True)
