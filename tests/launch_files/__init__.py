@@ -24,10 +24,13 @@ CASES = {
     "sensors.launch.xml": ("rate:=8.0",),
     "tools.launch.yaml": (),
     "events.launch.py": (),
+    "scopes.launch.py": (),
     "lifecycle.launch.py": (),
     "components.launch.py": (),
     "components.launch.xml": (),
 }
+#: Variables of the shell in which they were resolved.
+VARIABLES = {"DEMO_MODE": "plain", "DEMO_GONE": "1", "DEMO_PATH": "/opt"}
 #: Install prefix in the stored models.
 STORED_PREFIX = "/robot/install"
 
@@ -63,7 +66,7 @@ def resolved(share: Path, name: str, *arguments: str) -> dict[str, Any]:
     """Return what the resolver prints for a launch file of the package, with the stored prefix."""
     prefix = share.parent.parent
     before = os.environ.get("AMENT_PREFIX_PATH", "")
-    environment = {**os.environ, "AMENT_PREFIX_PATH": f"{prefix}:{before}"}
+    environment = {**os.environ, **VARIABLES, "AMENT_PREFIX_PATH": f"{prefix}:{before}"}
     done = subprocess.run(
         [sys.executable, "-m", "rosrm_launch.resolve", share / "launch" / name, *arguments],
         env=environment, stdout=subprocess.PIPE, check=True, timeout=60,

@@ -38,7 +38,7 @@ def main() -> NoReturn:
 
 def _answer(file: str, given: Sequence[str], *, show_arguments: bool) -> LaunchModel | Failure:
     try:
-        from rosrm_launch import visitor  # noqa: PLC0415 - imports launch, which may be missing
+        from rosrm_launch import visiting  # noqa: PLC0415 - imports launch, which may be missing
     except ImportError as error:
         return Failure(
             failure=f"{sys.executable} cannot import `launch` and `launch_ros`: {error}. They come "
@@ -48,9 +48,9 @@ def _answer(file: str, given: Sequence[str], *, show_arguments: bool) -> LaunchM
     arguments = dict(word.split(":=", 1) for word in given)
     try:
         if show_arguments:
-            return LaunchModel(file=file, arguments=visitor.declared(file))
-        return visitor.resolved(file, arguments)
-    except visitor.BadArguments as fault:
+            return LaunchModel(file=file, arguments=visiting.declared(file))
+        return visiting.resolved(file, arguments)
+    except visiting.BadArguments as fault:
         return Failure(failure=f"{file}: {fault}")
     except SystemExit as end:
         return Failure(failure=f"{file} exits with {end.code!r} instead of describing a launch")

@@ -314,7 +314,7 @@ def _remappings(rules: Sequence[tuple[str, str]]) -> dict[str, str]:
 
 
 def _restart(one: Process) -> Any:
-    if not one.respawn:
+    if not one.respawn or one.ends_all:  # launch does not respawn after a shutdown
         return "never"
     attempts = one.respawn_retries if one.respawn_retries >= 0 else _ENDLESS
     return {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -46,12 +47,16 @@ class RosArguments:
 
     def _read(self, path: Path) -> None:
         try:
-            sections = parse_parameters(path.read_text())
+            self.parameters += _sections(path.read_text())
         except ValueError as error:
             raise ValueError(f"parameters file {path}: {error}") from None
-        self.parameters += [
-            Parameters(nodes=one.nodes, values=dict(one.parameters)) for one in sections
-        ]
+
+
+@cache
+def _sections(text: str) -> tuple[Parameters, ...]:
+    """Return the sections of a parameters file, which many nodes may share."""
+    sections = parse_parameters(text)
+    return tuple(Parameters(nodes=one.nodes, values=dict(one.parameters)) for one in sections)
 
 
 def existing_paths(process: Process) -> list[str]:

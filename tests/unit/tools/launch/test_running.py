@@ -106,17 +106,24 @@ def test_a_thread_of_the_file_does_not_keep_the_resolver(file):
 
 
 @needs_launch
-def test_the_environment_of_a_process_is_what_the_file_changes(file):
-    """Variables are added; what cannot be done is listed."""
-    body = "return L([SetEnvironmentVariable('A', '1'), UnsetEnvironmentVariable('HOME'),\n"
-    body += "  ExecuteProcess(cmd=['x'], additional_env={'B': '2'}),\n"
-    body += "  ExecuteProcess(cmd=['y'], env={'C': '3'})])"
-    model = resolve(file(body), [], timeout=30.0)
-    assert [one.environment for one in model.processes] == [{"A": "1", "B": "2"}, {"C": "3"}]
-    assert [str(one).partition(": ")[2] for one in model.omissions] == [
-        "environment of x: HOME cannot be removed",
-        "environment of y: `env` replaces all variables; its own are added instead",
-    ]
+def test_arguments_that_only_substitutions_ask_for_are_known(file):
+    """`ros2 launch` takes them, too; `sigterm_timeout` and `launch-prefix` are such arguments."""
+    body = "from launch.substitutions import LaunchConfiguration as C\n"
+    body += "return L([ExecuteProcess(cmd=['x', C('speed', default='1')])])"
+    given = ["speed:=2", "sigterm_timeout:=9", "launch-prefix:=nice"]
+    (process,) = resolve(file(body), given, timeout=30.0).processes
+    assert process.command == ["x", "2"]
+    assert (process.interrupt_grace, process.prefix) == (9.0, ["nice"])
+
+
+@needs_launch
+def test_a_scope_ends_with_its_group(file, monkeypatch):
+    """A variable that has the same value in the shell is set only where the file sets it."""
+    monkeypatch.setenv("SIDE", "left")
+    body = "return L([GroupAction([SetEnvironmentVariable('SIDE', 'left'),\n"
+    body += "  ExecuteProcess(cmd=['x'])]), ExecuteProcess(cmd=['y'])])"
+    inner, outer = resolve(file(body), [], timeout=30.0).processes
+    assert (inner.environment, outer.environment) == ({"SIDE": "left"}, {})
 
 
 @needs_launch

@@ -92,6 +92,45 @@ def test_events_become_a_start_order_and_a_group():
     assert specs["late"].group == GroupMembership("events", "never")
 
 
+def test_a_process_whose_end_ends_all_is_not_restarted():
+    """In launch the shutdown comes before the respawn."""
+    (entry,) = made(node(0, "a", respawn=True, ends_all=True)).work["processes"]
+    assert entry["restart"] == "never"
+
+
+def test_groups_have_an_environment_and_parameters_of_their_own():
+    """A group without forwarding begins with the environment and settings of the shell."""
+    specs = specs_of("scopes.launch.py")
+    grouped, bare = specs["arm.grouped"], specs["bare"]
+    assert grouped.environment == {
+        "DEMO_MODE": "plain", "DEMO_PATH": "/opt:/usr/share", "ROS_LOG_DIR": "/tmp",
+    }  # fmt: skip
+    assert grouped.prefix == ("env", "-u", "DEMO_GONE", "nice", "-n", "3")
+    assert grouped.parameters == {"speed": 3, "rate": 1.0, "tolerance": 0.001}
+    assert grouped.remappings == {"chatter": "/chatter"}
+    assert (bare.environment, bare.prefix, bare.parameters) == ({}, (), {})
+
+
+def test_options_of_processes():
+    """Arguments for ROS follow those of the program; `exec_name` names a process without a node."""
+    specs = specs_of("scopes.launch.py")
+    options, labelled = specs["options"], specs["labelled"]
+    assert options.arguments == ("-v", "--ros-args", "--log-level", "debug")
+    assert options.environment == {"DEMO_EXTRA": "1"}
+    assert options.stop == StopPolicy(7.0, 8.0)
+    assert labelled.executable == "talker"
+    assert labelled.environment == {"DEMO_MODE": "plain", "DEMO_LATE": "1"}
+    assert specs["alone"].environment == {"DEMO_ONLY": "1"}
+
+
+def test_handlers_of_python_code_and_of_a_complete_execution():
+    """Both wait for the end of the process."""
+    specs = specs_of("scopes.launch.py")
+    assert specs["completed"].start_order == StartOrder({"first": "finished"})
+    assert specs["registered"].start_order == StartOrder({"first": "finished"})
+    assert specs["first"].kind is Kind.JOB
+
+
 def test_transitions_become_the_state_to_which_a_host_brings_a_node():
     """A node that the file only configures is inactive; what waits for a state waits for ready."""
     specs = specs_of("lifecycle.launch.py")
@@ -121,7 +160,14 @@ def test_transitions_of_unknown_nodes_are_listed():
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("events.launch.py", ["OnProcessIO", "OnProcessExit", "OnShutdown", "EmitEvent"]),
+        (
+            "events.launch.py",
+            ["OnProcessIO", "OnProcessExit", "OnShutdown", "LogInfo", "EmitEvent"],
+        ),
+        (
+            "scopes.launch.py",
+            ["SetROSLogDir", "environment of alone", "OnProcessStart", "LogInfo", "Node"],
+        ),
         ("lifecycle.launch.py", ["OnStateTransition", "transition inactive_shutdown of /maps"]),
         ("components.launch.py", ["component demo::Unnamed of /camera/pipeline"]),
         ("components.launch.xml", []),
