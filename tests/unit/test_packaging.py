@@ -68,7 +68,8 @@ OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJEC
 
 def test_every_distribution_is_looked_at() -> None:
     parts = (
-        "checkpoint container criu examples lab launch migration msgs resources scoring simulate"
+        "checkpoint container criu examples lab launch migration msgs resources scoring simulate "
+        "web"
     )
     assert {"rosrm", *(f"rosrm-{part}" for part in parts.split())} <= OWN
 
@@ -96,7 +97,7 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 def test_the_readme_installs_all_that_runs() -> None:
     """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned.
 
-    The tools `rosrm-lab`, `rosrm-launch` and `rosrm-simulate` are optional.
+    The tools `rosrm-lab`, `rosrm-launch`, `rosrm-simulate` and `rosrm-web` are optional.
     """
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
     optional = (
@@ -105,6 +106,7 @@ def test_the_readme_installs_all_that_runs() -> None:
         Path("tools/lab"),
         Path("tools/launch"),
         Path("tools/simulate"),
+        Path("tools/web"),
     )
     needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in optional]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])

@@ -41,20 +41,20 @@ def status_form(snapshot: Listing) -> dict[str, Any]:
 
 def show(value: Any) -> None:
     """Print one JSON value."""
-    echo(json.dumps(_finite(value), indent=2))
+    echo(json.dumps(finite(value), indent=2))
 
 
 def show_line(value: Any) -> None:
     """Print one JSON value on one line."""
-    echo(json.dumps(_finite(value)))
+    echo(json.dumps(finite(value)))
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
     """Replace NaN and infinity, which JSON lacks, by null."""
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
+        return {key: finite(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_finite(item) for item in value]
+        return [finite(item) for item in value]
     return value

@@ -148,7 +148,12 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
 
 @pytest.mark.parametrize(
     ("command", "distribution"),
-    [("lab", "rosrm-lab"), ("launch", "rosrm-launch"), ("simulate", "rosrm-simulate")],
+    [
+        ("lab", "rosrm-lab"),
+        ("launch", "rosrm-launch"),
+        ("simulate", "rosrm-simulate"),
+        ("web", "rosrm-web"),
+    ],
 )
 def test_a_command_whose_distribution_is_absent_names_it(rosrm, monkeypatch, command, distribution):
     """A command of this repository that is not installed says in one sentence where it is."""

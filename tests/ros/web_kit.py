@@ -1,0 +1,110 @@
+"""A real `rosrm web` beside a cluster of a test, and an HTTP client for it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import urlsplit
+
+from tests.ros.clusters import Cluster
+from tests.waiting import PATIENCE, wait_until
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An HTTP answer."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.body)
+
+
+class Gateway:
+    """A running `rosrm web`.
+
+    Attributes:
+        url: address that the command printed.
+    """
+
+    def __init__(self, cluster: Cluster, *words: str) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "rosrm.cli", "web", "--listen", "127.0.0.1:0", *words],
+            env={**os.environ, **cluster.ros.environment(), "PYTHONUNBUFFERED": "1"},
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        self.said: list[str] = []
+        threads = [
+            threading.Thread(target=self.said.extend, args=(stream,), daemon=True)
+            for stream in (self.process.stdout, self.process.stderr)
+        ]
+        for thread in threads:
+            thread.start()
+        self.url = wait_until(self._url, "rosrm web prints its address", seen=lambda: self.said)
+
+    def _url(self) -> str:
+        lines = [line for line in self.said if line.startswith("rosrm web: ")]
+        assert self.process.poll() is None, self.said
+        return lines[0].split()[2].partition("/v1")[0] if lines else ""
+
+    @property
+    def address(self) -> tuple[str, int]:
+        parts = urlsplit(self.url)
+        return str(parts.hostname), int(parts.port or 0)
+
+    def ask(self, path: str, body: object = None, **headers: str) -> Answer:
+        """Send a request: GET, or POST with a body."""
+        connection = http.client.HTTPConnection(*self.address, timeout=PATIENCE)
+        given = {name.replace("_", "-"): value for name, value in headers.items()}
+        content = None
+        if body is not None:
+            content = json.dumps(body)
+            given.setdefault("Content-Type", "application/json")
+        try:
+            connection.request("GET" if body is None else "POST", path, content, given)
+            answer = connection.getresponse()
+            return Answer(answer.status, dict(answer.headers), answer.read())
+        finally:
+            connection.close()
+
+    def get(self, path: str) -> Any:
+        """Return the value at a path, which has to be there."""
+        answer = self.ask(path)
+        assert answer.status == 200, answer
+        return answer.json
+
+    def wait_for_master(self, state: str) -> None:
+        wait_until(
+            lambda: self.get("/v1/status")["gateway"]["state"] == state,
+            f"the gateway says that the master is {state}",
+            seen=lambda: self.get("/v1/status")["gateway"],
+        )  # fmt: skip
+
+    def end(self, number: int = signal.SIGINT) -> int:
+        """End the gateway with a signal; return its exit code."""
+        self.process.send_signal(number)
+        return self.process.wait(PATIENCE)
+
+
+@contextmanager
+def gateway(cluster: Cluster, *words: str) -> Iterator[Gateway]:
+    """Yield a gateway that ends afterwards, with success and without a traceback."""
+    one = Gateway(cluster, *words)
+    try:
+        yield one
+    finally:
+        code = one.end() if one.process.poll() is None else 0
+    assert code == 0, one.said
+    assert not any("Traceback" in line for line in one.said), "".join(one.said)

@@ -1,0 +1,88 @@
+"""The command `rosrm web`."""
+
+# What only a running gateway needs is imported when it runs, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import logging
+import sys
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rosrm.cli.connection import ros_settings
+from rosrm.cli.options import CommonOptions, Domain
+from rosrm.cli.output.plain import echo
+from rosrm_web.settings import DEFAULT_LISTEN, checked
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.client.retrying import Notify
+    from rosrm.model.ros_settings import RosSettings
+
+#: Seconds for one search for the master.
+_SEARCH = 2.0
+
+
+def web(  # noqa: PLR0917 - an argument for each option
+    ctx: typer.Context,
+    listen: Annotated[
+        str,
+        typer.Option(
+            "--listen", metavar="ADDRESS[:PORT]", help="IP address, e.g. 0.0.0.0 or [::1]:8291."
+        ),
+    ] = DEFAULT_LISTEN,
+    certificate: Annotated[
+        Path | None,
+        typer.Option(
+            "--certificate", metavar="FILE", help="PEM file: HTTPS with this certificate."
+        ),
+    ] = None,
+    key: Annotated[
+        Path | None,
+        typer.Option("--key", metavar="FILE", help="PEM file with its key, with mode 0600."),
+    ] = None,
+    plain_http: Annotated[
+        bool,
+        typer.Option("--plain-http", help="Allow HTTP without TLS beyond this machine."),
+    ] = False,
+    names: Annotated[
+        list[str] | None,
+        typer.Option("--name", metavar="NAME", help="DNS name of this machine; repeatable."),
+    ] = None,
+    domain: Domain = None,
+) -> None:
+    """Serve the state of the cluster over HTTP until Ctrl-C.
+
+    The gateway is a client of the master, and only reads. It listens on 127.0.0.1:8290.
+    """
+    from rosrm_web.gateway import Gateway
+    from rosrm_web.serving import open_socket, serve, url_of
+
+    settings = checked(
+        listen, certificate=certificate, key=key, plain_http=plain_http, names=names or ()
+    )
+    _log_to_stderr()
+    cluster = ctx.obj.cluster if isinstance(ctx.obj, CommonOptions) else None
+    gateway = Gateway(partial(_connect, ros_settings(ctx, domain), cluster))
+    with open_socket(settings) as listener:
+        said = f"rosrm web: {url_of(listener, settings)}/v1/status; it only reads"
+        serve(gateway, settings, listener, lambda: echo(said))
+
+
+def _connect(ros: RosSettings, cluster: Path | None, notify: Notify) -> Client:
+    from rosrm.client.client import Client
+
+    return Client(ros=ros, cluster=cluster, timeout=_SEARCH, notify=notify)
+
+
+def _log_to_stderr() -> None:
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.WARNING, handlers=[handler])
+    logging.getLogger("rosrm.web").setLevel(logging.INFO)
+    # The end of requests that follow changes is no error.
+    logging.getLogger("uvicorn.error").setLevel(logging.CRITICAL)

@@ -1,0 +1,63 @@
+"""The gateway without HTTP: its links to the master, and what all requests share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from rosrm.errors import NoMaster
+from rosrm_web.listings import Listings
+from rosrm_web.master_link import MasterLink
+from rosrm_web.watching import Watcher
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.client.retrying import Notify
+    from rosrm.model.rows import Listing
+
+T = TypeVar("T")
+
+
+class Gateway:
+    """Links to the master.
+
+    Each has a client of its own, so that a silent slave delays only those who read logs, and a
+    request that waits does not delay the listings.
+
+    Attributes:
+        reading: listings, and the regular requests of the watcher.
+        acting: requests that act, and explanations.
+        logs: logs, which the slaves send.
+        watcher: knows if the master answers.
+    """
+
+    def __init__(self, connect: Callable[[Notify], Client]) -> None:
+        self.reading = MasterLink("reading", connect)
+        self.acting = MasterLink("acting", connect)
+        self.logs = MasterLink("logs", connect)
+        self.watcher = Watcher(self.reading)
+        self._listings = Listings(self.reading)
+
+    async def ask(self, link: MasterLink, request: Callable[[Client], T]) -> T:
+        """Return the result of a request; without a master, refuse it at once.
+
+        Raises:
+            NoMaster: the master is lost, or was never found.
+            RosrmError: as `MasterLink.ask`.
+        """
+        self._require_master()
+        return await link.ask(request)
+
+    async def list(self, **parts: Any) -> Listing:
+        """Return a recent listing, as `Listings.get`; otherwise as `ask`."""
+        self._require_master()
+        return await self._listings.get(**parts)
+
+    def _require_master(self) -> None:
+        if self.watcher.master.state != "up":
+            raise NoMaster(self.watcher.master.reason)
+
+    def close(self) -> None:
+        """Leave ROS."""
+        for link in (self.reading, self.acting, self.logs):
+            link.close()

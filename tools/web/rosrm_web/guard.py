@@ -1,0 +1,188 @@
+"""Checks of each request before any other code sees it, and the headers of each answer."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from typing import Any, Final
+
+from rosrm_web import problems
+from rosrm_web.settings import Settings
+
+Scope = MutableMapping[str, Any]
+Message = MutableMapping[str, Any]
+Receive = Callable[[], Awaitable[Message]]
+Send = Callable[[Message], Awaitable[None]]
+App = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+#: Most bytes of the body of a request, such as a work file.
+LARGEST_BODY: Final = 4 * 2**20
+#: Seconds for the body of a request.
+BODY_TIMEOUT: Final = 10.0
+#: Methods that change nothing.
+_SAFE: Final = frozenset({"GET", "HEAD", "OPTIONS"})
+#: Values of Sec-Fetch-Site, which browsers send, for a request of our own page or of the user.
+_OWN_SITES: Final = frozenset({"", "none", "same-origin"})
+
+#: Headers of every answer. No other page may read, frame or guess it, and no cache keeps it.
+_HEADERS: Final = {
+    b"cache-control": b"no-store",
+    b"content-security-policy": b"default-src 'none'; frame-ancestors 'none'",
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"permissions-policy": b"camera=(), geolocation=(), microphone=()",
+    b"referrer-policy": b"no-referrer",
+    b"x-content-type-options": b"nosniff",
+    b"x-frame-options": b"DENY",
+}
+_WITH_TLS: Final = {b"strict-transport-security": b"max-age=31536000"}
+
+
+class Rejected(Exception):
+    """A request that is answered without a look at its path.
+
+    Args:
+        status: HTTP status code.
+        detail: sentence for the user.
+    """
+
+    def __init__(self, status: int, detail: str) -> None:
+        super().__init__(detail)
+        self.status = status
+
+
+class Guard:
+    """ASGI application that checks requests, and passes valid ones to another application."""
+
+    def __init__(self, app: App, settings: Settings) -> None:
+        self._app = app
+        self._settings = settings
+        self._headers = {**_HEADERS, **(_WITH_TLS if settings.certificate else {})}
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        try:
+            headers = single_headers(scope["headers"])
+            check_host(headers, self._settings.host_names)
+            check_origin(scope, headers, self._settings.scheme)
+            if scope["type"] == "http":
+                receive = await _with_body(scope, headers, receive)
+        except Rejected as error:
+            await _reject(error, scope, receive, self._hardened(send))
+            return
+        await self._app(scope, receive, self._hardened(send))
+
+    def _hardened(self, send: Send) -> Send:
+        """Return `send` with the headers of every answer; an application may set its own."""
+
+        async def send_hardened(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = list(message.get("headers", ()))
+                names = {name.lower() for name, _ in given}
+                ours = [one for one in self._headers.items() if one[0] not in names]
+                message = {**message, "headers": [*given, *ours]}
+            await send(message)
+
+        return send_hardened
+
+
+def single_headers(headers: list[tuple[bytes, bytes]]) -> Mapping[str, str]:
+    """Return the headers of a request; refuse a second value of one that the guard reads."""
+    found: dict[str, str] = {}
+    for name, value in headers:
+        key = name.decode("latin-1").lower()
+        if key in found and key in ("host", "origin", "authorization", "content-length"):
+            raise Rejected(400, f"the header {key} is there twice")
+        found[key] = value.decode("latin-1")
+    return found
+
+
+def check_host(headers: Mapping[str, str], names: frozenset[str]) -> None:
+    """Refuse a request for another host name.
+
+    A page of the internet can let its own name point to this machine (DNS rebinding), but then its
+    requests carry that name.
+    """
+    host = headers.get("host", "")
+    bare = _without_port(host).lower()
+    if bare in names or _is_address(bare):
+        return
+    raise Rejected(
+        421, f"the request is for the host {host!r:.100}. Allowed: the IP address of this machine, "
+        f"{', '.join(sorted(names))}, and names given by `rosrm web --name NAME`",
+    )  # fmt: skip
+
+
+def _without_port(host: str) -> str:
+    if host.startswith("["):
+        return host[1:].partition("]")[0]
+    return host.partition(":")[0]
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ipaddress.ip_address(text)
+    except ValueError:
+        return False
+    return True
+
+
+def check_origin(scope: Scope, headers: Mapping[str, str], scheme: str) -> None:
+    """Refuse a request that acts, or a WebSocket, if a page of another origin sends it."""
+    if scope["type"] == "http" and scope["method"] in _SAFE:
+        return
+    origin = headers.get("origin", "")
+    is_own = origin in ("", f"{scheme}://{headers.get('host', '')}")
+    if not is_own or headers.get("sec-fetch-site", "") not in _OWN_SITES:
+        raise Rejected(403, f"a page of another origin sent the request: {origin!r:.100}")
+
+
+async def _with_body(scope: Scope, headers: Mapping[str, str], receive: Receive) -> Receive:
+    """Read the whole body, and return a `receive` that repeats it."""
+    announced = headers.get("content-length", "0")
+    if announced.isdecimal() and int(announced) > LARGEST_BODY:
+        raise _too_large()
+    try:
+        body = await asyncio.wait_for(_body(receive), BODY_TIMEOUT)
+    except asyncio.TimeoutError:
+        raise Rejected(408, f"the body did not arrive within {BODY_TIMEOUT:g} s") from None
+    if body and scope["method"] in _SAFE:
+        raise Rejected(400, f"a {scope['method']} request has no body")
+    first: list[Message] = [{"type": "http.request", "body": body, "more_body": False}]
+
+    async def repeat() -> Message:
+        return first.pop() if first else await receive()
+
+    return repeat
+
+
+async def _body(receive: Receive) -> bytes:
+    parts: list[bytes] = []
+    size = 0
+    while True:
+        message = await receive()
+        if message["type"] != "http.request":
+            raise Rejected(400, "the client left before its request was complete")
+        parts.append(message.get("body", b""))
+        size += len(parts[-1])
+        if size > LARGEST_BODY:
+            raise _too_large()
+        if not message.get("more_body", False):
+            return b"".join(parts)
+
+
+def _too_large() -> Rejected:
+    return Rejected(413, f"the body of a request is at most {LARGEST_BODY} bytes")
+
+
+async def _reject(error: Rejected, scope: Scope, receive: Receive, send: Send) -> None:
+    if scope["type"] == "websocket":
+        await send({"type": "websocket.close", "code": 1008, "reason": str(error)[:100]})
+        return
+    # The rest of the request is not read: the connection must not be used again.
+    headers = {"connection": "close"}
+    await problems.answer(error.status, str(error), headers=headers)(scope, receive, send)

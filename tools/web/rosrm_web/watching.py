@@ -1,0 +1,88 @@
+"""State of the master, and the newest events, by regular requests."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final, Literal
+
+from rosrm.errors import NoMaster, RosrmError
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.model.rows import Listing
+    from rosrm_web.master_link import MasterLink
+
+#: Seconds between two requests to the master.
+PERIOD: Final = 0.5
+#: Seconds without an answer after which the master counts as lost.
+SILENCE: Final = 2.0
+
+State = Literal["searching", "up", "lost"]
+
+_log = logging.getLogger("rosrm.web")
+
+
+@dataclass(frozen=True)
+class MasterState:
+    """Condition of the master as the gateway sees it.
+
+    Attributes:
+        state: "searching": the master has not answered yet; "up"; "lost": it does not answer.
+        reason: why there is no master; "": there is one.
+    """
+
+    state: State = "searching"
+    reason: str = "the gateway is searching for a master"
+
+
+def give_up_early(seconds: float) -> None:
+    """End a listing to which the master is silent; the argument is the seconds of the wait."""
+    if seconds >= SILENCE:
+        raise NoMaster(
+            f"the master has not answered for {SILENCE:g} s; the gateway asks again until it "
+            "answers. Is `rosrm master` running?"
+        )
+
+
+class Watcher:
+    """Asks the master for new events, and so learns if the master answers.
+
+    Attributes:
+        master: newest known state of the master.
+    """
+
+    def __init__(self, link: MasterLink) -> None:
+        self._link = link
+        self._after = -1
+        self.master = MasterState()
+
+    async def run(self) -> None:
+        """Ask until the task is cancelled."""
+        while True:
+            with suppress(RosrmError):  # the state of the master has it
+                await self.look()
+            await asyncio.sleep(PERIOD)
+
+    async def look(self) -> None:
+        """Ask once; raises `RosrmError`."""
+        try:
+            listing = await self._link.ask(self._list)
+        except RosrmError as error:
+            state: State = "lost" if self._after >= 0 else "searching"
+            self._set_master(MasterState(state, str(error)))
+            raise
+        self._set_master(MasterState("up", ""))
+        self._after = listing.last_sequence
+
+    def _list(self, client: Client) -> Listing:
+        if self._after < 0:  # the events before the first request are no changes
+            return client.list(on_wait=give_up_early)
+        return client.list(events=True, after=self._after, on_wait=give_up_early)
+
+    def _set_master(self, master: MasterState) -> None:
+        if master.state != self.master.state:
+            _log.info("master is %s%s", master.state, f": {master.reason}" if master.reason else "")
+        self.master = master
