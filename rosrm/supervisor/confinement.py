@@ -82,11 +82,13 @@ class Confinement:
             LimitRefused: one of them cannot be changed, or is required and cannot be enforced
                 here; all are as before.
         """
-        lacking = {name: why for name, why in self.missing.items() if name in limits.given_limits}
+        given = limits.given_limits
+        lacking = self.groups.lacking(key, limits)
+        lacking.update((name, why) for name, why in self.missing.items() if name in given)
         if limits.required and lacking:
             raise LimitRefused(_lacks(lacking))
-        held = self.groups.change(key, former, limits)
-        return tuple(name for name in held if name not in self.missing)
+        self.groups.change(key, former, limits)
+        return tuple(name for name in given if name not in lacking)
 
     def _check_cpus(self, limits: LimitRule) -> None:
         lacking = sorted(set(limits.cpus) - self._cpus)

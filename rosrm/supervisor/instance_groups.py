@@ -13,7 +13,7 @@ import errno
 import os
 import signal
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
@@ -46,6 +46,7 @@ class InstanceGroups:
     def __init__(self, trees: Sequence[Tree] = ()) -> None:
         self.trees = tuple(trees)
         self._made: dict[Key, tuple[Tree, ...]] = {}
+        self._unset: dict[Key, dict[str, Any]] = {}  # limits that could not be set at the start
         self._kills_before: dict[Key, int] = {}
         self._emptied: dict[str, float] = {}
 
@@ -95,15 +96,24 @@ class InstanceGroups:
                     if controller in tree.controllers
                 )  # fmt: skip
         self._made[key] = tuple(made)
+        self._unset[key] = {name.removeprefix("limits."): 0.0 for name in faults}
         self._kills_before[key] = self._kills(key)
         return faults
 
-    def change(self, key: Key, former: LimitRule, limits: LimitRule) -> list[str]:
-        """Change the limits of an instance that runs; return the names of those that hold.
+    def lacking(self, key: Key, limits: LimitRule) -> dict[str, str]:
+        """Return the limits for which an instance has no group, with the reasons."""
+        known = {name for tree in self._made.get(key, ()) for name in tree.controllers}
+        why = "the instance has no control group for it"
+        return {name: why for name in limits.given_limits if _CONTROLLER[name] not in known}
+
+    def change(self, key: Key, former: LimitRule, limits: LimitRule) -> None:
+        """Change the limits of an instance that runs, in the groups that it has.
 
         Raises:
             LimitRefused: one of them cannot be changed; all are as before.
         """
+        unset = self._unset.pop(key, {})
+        former = former._replace(**unset)
         trees, done = self._made.get(key, ()), list[Tree]()
         for tree in trees:
             path = _path(tree, key)
@@ -113,9 +123,8 @@ class InstanceGroups:
             for fault in faults:
                 for changed in done:
                     _set_limits(_path(changed, key), changed, former, limits)
+                self._unset[key] = unset
                 raise LimitRefused(fault)
-        known = {name for tree in trees for name in tree.controllers}
-        return [name for name in limits.given_limits if _CONTROLLER[name] in known]
 
     @contextlib.contextmanager
     def inside(self, key: Key) -> Iterator[int]:
@@ -171,6 +180,7 @@ class InstanceGroups:
     def remove(self, key: Key, now: float) -> None:
         """Remove the group of an instance that has ended, with all that may be left in it."""
         self._kills_before.pop(key, None)
+        self._unset.pop(key, None)
         for tree in self._made.pop(key, ()):
             self._end(_path(tree, key), now)
 

@@ -37,6 +37,7 @@ from rosrm.core.master.state.process import (
     BEFORE_START,
     DesiredState,
     Instance,
+    PendingAmendment,
     Process,
     ProcessPhase,
     ends_group,
@@ -83,7 +84,7 @@ class MasterState:
         modes: sets of applications, and the one in force.
         terminal: names of the terminal processes, in the order in which they ended.
         unamended: name of each process whose slave has not changed the running instance yet, to the
-            time of the last order.
+            change.
         ended_members: principal and name of each group that has to end, because one of its
             processes has ended in this step, to the first such process.
         standbys: process name to the migration whose destination is its standby.
@@ -135,7 +136,7 @@ class MasterState:
         self.flows = Flows()
         self.link_queries = LinkQueries()
         self.set_aside: set[str] = set()
-        self.unamended: dict[str, float] = {}
+        self.unamended: dict[str, PendingAmendment] = {}
         self.time_limited: dict[str, None] = {}
         self.scheduled: dict[str, None] = {}
         self.preemption = Preemption()

@@ -12,9 +12,10 @@ from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Reply
 from rosrm.model.applications import Action, ApplicationRow, Target
 from rosrm.model.arrays import ArrayMembership
-from rosrm.model.orders import StartInstance
+from rosrm.model.orders import AmendInstance, StartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
+    Amendment,
     InstanceState,
     InstanceStatus,
     Limits,
@@ -147,6 +148,38 @@ def test_limits_that_the_slave_refuses_lead_back() -> None:
     assert (state_of(cluster), cluster["p"].owner) == ((1, []), owner)
     assert cluster["p"].spec.limits == Limits(memory=2e9)
     assert not cluster.state.unamended
+
+
+def test_refused_limits_without_a_former_version_degrade_the_application() -> None:
+    """The list says what the record says, until the slave accepts the limits."""
+    cluster = Cluster(Machine("a", uses=1e9))
+    cluster.apply("nav", process("p", limits=Limits(memory=2e9)))
+    cluster.apply("nav", process("p", limits=Limits(memory=5e8)))  # version 1 was not reached yet
+    cluster.wait(3.0)
+    why = "its slave refuses: it uses 1e+09 B already"
+    assert cluster.recorded("application_failed") == [f"nav is degraded: p: {why}"]
+    assert (row(cluster).state, row(cluster).running) == ("degraded", 0)
+    assert row(cluster).reason == f"p is not changed: {why}"
+    cluster.machines["a"].uses = 0.0
+    cluster.wait(3.0)
+    assert (row(cluster).state, row(cluster).reason) == ("running", "")
+
+
+def test_an_order_has_no_limits_where_only_the_restart_policy_changes() -> None:
+    """A supervisor of an earlier version, which cannot change limits, would refuse all of it."""
+    cluster = Cluster("a")
+    spec = process("p", limits=Limits(memory=2e9))
+    cluster.apply("nav", spec)
+    cluster.apply("nav", replace(spec, restart=RestartPolicy("always")))
+    cluster.wait(1.0)
+    (order,) = cluster.orders(AmendInstance)
+    assert order.amendment == Amendment(RestartPolicy("always"), limits=None)
+    cluster.cut("a")
+    for limit, when in ((1e9, "always"), (1e9, "never")):
+        policy = RestartPolicy(when)
+        cluster.apply("nav", replace(spec, limits=Limits(memory=limit), restart=policy))
+        cluster.wait(1.0)
+    assert cluster.orders(AmendInstance)[-1].amendment.limits == Limits(memory=1e9)
 
 
 def test_refused_limits_stay_open_when_the_paused_version_is_applied_again() -> None:
@@ -877,6 +910,19 @@ def test_a_plan_shows_a_return_to_the_former_version() -> None:
     assert (cluster["p"].owner, state_of(cluster)) == (owner, (1, []))
     planned = cluster.apply("nav", replace(never, arguments=("again",)), plan=True)
     assert "nav would return to version 1: p: no host may take its new version" in planned.message
+
+
+def test_a_plan_says_that_a_host_may_refuse_lower_limits() -> None:
+    """A plan assumes that each order is carried out; the usage lets the user judge."""
+    cluster = Cluster(Machine("a", uses=1e9))
+    cluster.machines["a"].shown["p"] = {"memory": 1e9}
+    cluster.apply("nav", process("p", limits=Limits(memory=2e9, cpu=1.0)))
+    cluster.wait(1.0)
+    reasons = []
+    for limits in (Limits(memory=5e8, cpu=1.0), Limits(memory=2e9, cpu=2.0)):
+        (planned,) = cluster.apply("nav", process("p", limits=limits), plan=True).actions
+        reasons.append(planned.reason)
+    assert reasons == ["its host refuses a memory limit below the usage, 1.0 GB now", ""]
 
 
 def test_a_plan_shows_what_waits_for_room() -> None:

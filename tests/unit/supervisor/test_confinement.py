@@ -19,7 +19,7 @@ from rosrm.runtime import cgroups
 from rosrm.supervisor import group_trees, instance_groups
 from rosrm.supervisor.confinement import Confinement
 from rosrm.supervisor.group_trees import Tree
-from rosrm.supervisor.instance_groups import InstanceGroups, limit_files
+from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused, limit_files
 from rosrm.supervisor.spawn import ScheduleRefused, SpawnError
 from tests.waiting import PATIENCE
 
@@ -120,6 +120,35 @@ def test_a_group_that_cannot_be_made_refuses_a_start_that_requires_it(confinemen
     confinement.groups = full
     with pytest.raises(SpawnError, match=r"cannot enforce limits\.memory: no control group "):
         confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
+
+
+def test_limits_that_change_without_a_group_do_not_hold(confinement, full) -> None:
+    """They are refused where they are required."""
+    confinement.groups = full
+    former, limits = LimitRule(memory=1e8), LimitRule(memory=2e8)
+    confinement.start(KEY, former, started)
+    assert confinement.change(KEY, former, limits) == ()
+    refusal = r"cannot enforce limits\.memory: the instance has no control group for it"
+    with pytest.raises(LimitRefused, match=refusal):
+        confinement.change(KEY, former, limits._replace(required=True))
+
+
+def test_a_limit_that_could_not_be_set_at_the_start_is_set_with_the_next_change(
+    confinement, tmp_path: Path
+) -> None:
+    """Otherwise a limit that does not hold would be reported as enforced."""
+    group = tmp_path / "top" / "camera.1"
+    group.mkdir(parents=True)
+    for name in ("cpu.cfs_period_us", "cpu.cfs_quota_us"):
+        (group / name).touch()
+    tree = Tree(1, str(group.parent), str(tmp_path), ("memory", "cpu"))
+    confinement.groups = InstanceGroups([tree])
+    former = LimitRule(memory=1e8, cpu=1.0)
+    assert list(confinement.groups.make(KEY, former, realtime=False)) == ["limits.memory"]
+    (group / "memory.limit_in_bytes").touch()
+    changed = confinement.change(KEY, former, former._replace(cpu=2.0))
+    assert changed == ("limits.memory", "limits.cpu")
+    assert (group / "memory.limit_in_bytes").read_text() == "100000000"
 
 
 class Closed(InstanceGroups):

@@ -5,21 +5,26 @@ from __future__ import annotations
 from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.pending_orders import InstanceAmendment
+from rosrm.core.master.state.process import PendingAmendment
 from rosrm.model.orders import NOT_AMENDED, AmendInstance
 from rosrm.model.values import Amendment, ProcessSpec
 
 
 def review(state: MasterState, now: float) -> None:
     """Order the changes; repeat orders that were refused or have no answer."""
-    for name, ordered_at in list(state.unamended.items()):
+    for name, pending in list(state.unamended.items()):
         process = state.processes.get(name)
         owner = state.instances.get(process.owner) if process is not None else None
         if process is None or owner is None:
             del state.unamended[name]  # its next instance starts with the new spec
-        elif name not in state.migrations and now - ordered_at >= state.settings.order_retry:
-            state.unamended[name] = now
-            order = AmendInstance(owner.id, _amendment(process.spec))
+        elif name not in state.migrations and _is_due(state, pending, now):
+            pending.ordered_at = now
+            order = AmendInstance(owner.id, _amendment(process.spec, pending))
             state.send(owner.host, order, InstanceAmendment(owner.id, order.amendment))
+
+
+def _is_due(state: MasterState, pending: PendingAmendment, now: float) -> bool:
+    return now - pending.ordered_at >= state.settings.order_retry
 
 
 def note_answer(state: MasterState, change: InstanceAmendment, event: OrderAnswered) -> None:
@@ -27,16 +32,20 @@ def note_answer(state: MasterState, change: InstanceAmendment, event: OrderAnswe
     process = state.processes.get(change.instance.process)
     if process is None or process.owner != change.instance.number:
         return
-    if _amendment(process.spec) != change.amendment or process.name not in state.unamended:
+    pending = state.unamended.get(process.name)
+    if pending is None or _amendment(process.spec, pending) != change.amendment:
         return
     application = state.applications.get(process.spec.application)
     task = application.tasks.get(process.name) if application is not None else None
     if event.accepted:
         del state.unamended[process.name]
         state.save(process)
-    elif event.code == NOT_AMENDED and task is not None:
-        task.fault = f"its slave refuses: {event.message}"
+    elif event.code == NOT_AMENDED:
+        pending.refusal = f"its slave refuses: {event.message}"
+        if task is not None:
+            task.fault = pending.refusal
 
 
-def _amendment(spec: ProcessSpec) -> Amendment:
-    return Amendment(spec.restart, spec.limits)
+def _amendment(spec: ProcessSpec, pending: PendingAmendment) -> Amendment:
+    """Return the change; a supervisor of an earlier version refuses one with limits."""
+    return Amendment(spec.restart, spec.limits if pending.limits else None)

@@ -73,6 +73,9 @@ def _why_unwell(state: MasterState, application: Application, name: str) -> str:
         return "does not exist any more"
     if name not in application.tasks and _is_of_another_version(state, application, name):
         return "is still of another version"
+    pending = state.unamended.get(name)
+    if pending is not None and pending.refusal and name not in application.tasks:
+        return f"is not changed: {pending.refusal}"
     if process.phase in _WELL or process.is_finished_job:
         return ""
     if process.phase is ProcessPhase.FINISHED:

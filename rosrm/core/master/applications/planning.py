@@ -24,6 +24,7 @@ from rosrm.model.applications import Action, PlannedAction
 from rosrm.model.orders import FenceInstance, StartInstance, StopInstance
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.model.values import EMPTY, InstanceId, InstanceState, InstanceStatus
+from rosrm.wording import size
 
 #: Seconds between two rounds of a plan, beyond the time for which a new instance must run well.
 _ROUND: Final = 2.0
@@ -221,9 +222,22 @@ def _action(
         return None
     return PlannedAction(
         new.name, kind or Action.REPLACE, new.spec.application, becomes, was,
-        fields=_changed(old, after, new), waits=waits,
+        reason=_refusable(before, old, new), fields=_changed(old, after, new), waits=waits,
         decision=None if decision is None else dict(decision),
     )  # fmt: skip
+
+
+def _refusable(before: MasterState, old: Process | None, new: Process) -> str:
+    """Return when the host refuses a change of the running instance; "": it does not."""
+    owner = before.instances.get(old.owner) if old is not None else None
+    limit = new.spec.limits.memory
+    if old is None or owner is None or new.owner != old.owner:
+        return ""
+    if not limit or limit == old.spec.limits.memory:
+        return ""
+    used = owner.seen.get("memory")
+    usage = f", {size(used)} now" if used else ""
+    return f"its host refuses a memory limit below the usage{usage}"
 
 
 def _changed(old: Process | None, after: MasterState, new: Process) -> tuple[str, ...]:

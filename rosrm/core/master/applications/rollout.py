@@ -40,7 +40,13 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import add_process, still_stopping
 from rosrm.core.master.schedules import await_first_run
 from rosrm.core.master.state.applications import Application, Task
-from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
+from rosrm.core.master.state.process import (
+    WAITING,
+    DesiredState,
+    PendingAmendment,
+    Process,
+    ProcessPhase,
+)
 from rosrm.model.applications import Action
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.requester import Requester
@@ -186,7 +192,9 @@ def _change_in_place(state: MasterState, process: Process, spec: ProcessSpec, no
         return
     state.set_spec(process, changed)
     if (changed.restart, changed.limits) != (before.restart, before.limits) and process.owner:
-        state.unamended[process.name] = -inf
+        pending = state.unamended.get(process.name)
+        limits = changed.limits != before.limits or (pending is not None and pending.limits)
+        state.unamended[process.name] = PendingAmendment(limits)
     if process.phase is ProcessPhase.SET_ASIDE:
         reconsider_set_aside(state, now)
 

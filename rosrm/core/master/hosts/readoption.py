@@ -6,11 +6,15 @@ job that has completed in between is complete. If a successor has started, the i
 
 from __future__ import annotations
 
-from math import inf
-
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.process import WAITING, LeftBehind, Process, ProcessPhase
+from rosrm.core.master.state.process import (
+    WAITING,
+    LeftBehind,
+    PendingAmendment,
+    Process,
+    ProcessPhase,
+)
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
@@ -53,7 +57,7 @@ def _readopt(
     )  # fmt: skip
     # A migration at the time of the loss may have ordered the slave not to restart the instance,
     # and its application may have changed since.
-    state.unamended[process.name] = -inf
+    state.unamended[process.name] = PendingAmendment()
     state.save(process)
 
 

@@ -8,12 +8,11 @@ active. The plan then continues as usual, forward or back.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import inf
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.migration import End
-from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.core.master.state.process import DesiredState, PendingAmendment, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
 
@@ -59,7 +58,8 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
     process.wanted = DesiredState.RUN
     state.clear_left_behind(process)
     process.standby_reason = ""
-    state.unamended[process.name] = -inf  # it may have changed since the standby was started
+    # The spec may have changed since the standby was started.
+    state.unamended[process.name] = PendingAmendment()
     state.migrations[process.name] = migration
     why, host = migration.cause, migration.destination_host.name
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"its standby takes over: {why}")

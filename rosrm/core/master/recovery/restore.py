@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import inf
 from typing import Any
 
 from rosrm.core.master.checkpoint import images
@@ -20,7 +19,14 @@ from rosrm.core.master.state import applications, migration
 from rosrm.core.master.state import process as processes
 from rosrm.core.master.state.migration import Migration, end_from_dict, undo_steps
 from rosrm.core.master.state.modes import restored_modes
-from rosrm.core.master.state.process import DesiredState, Image, LeftBehind, Process, ProcessPhase
+from rosrm.core.master.state.process import (
+    DesiredState,
+    Image,
+    LeftBehind,
+    PendingAmendment,
+    Process,
+    ProcessPhase,
+)
 from rosrm.model.codec import fields_from_plain, from_plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
@@ -95,7 +101,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     next_spec = item.get("next_spec")  # absent in older journals
     process.next_spec = None if next_spec is None else from_plain(ProcessSpec, next_spec)
     if not item.get("amended", True):
-        state.unamended[process.name] = -inf
+        state.unamended[process.name] = PendingAmendment()
     process.set_start(process.began, state.wall, now)
     if not process.is_at_rest:
         process.exit_code, process.ended_on = None, ""

@@ -15,7 +15,7 @@ from rosrm.core.master.state.applications import (
 )
 from rosrm.core.master.state.migration import Migration, migration_to_dict
 from rosrm.core.master.state.modes import Modes, mode_to_dict, modes_to_dict
-from rosrm.core.master.state.process import JOURNALED, Instance, Process
+from rosrm.core.master.state.process import JOURNALED, Instance, PendingAmendment, Process
 from rosrm.model.codec import to_plain
 from rosrm.model.modes import Mode
 from rosrm.model.records import Intent
@@ -30,7 +30,7 @@ class Tables(Protocol):
     processes: dict[str, Process]
     instances: dict[int, Instance]
     standbys: dict[str, Migration]
-    unamended: dict[str, float]
+    unamended: dict[str, PendingAmendment]
 
 
 class Unsaved:

@@ -137,6 +137,21 @@ class Instance:
 _RUNS: Final = frozenset({InstanceState.RUNNING, InstanceState.READY})
 
 
+@dataclass(slots=True)
+class PendingAmendment:
+    """Change of a running instance that its slave has not made yet.
+
+    Attributes:
+        limits: the limits may differ, too.
+        ordered_at: time of the last order; -inf: none.
+        refusal: why the slave refuses it; "": it does not.
+    """
+
+    limits: bool = True
+    ordered_at: float = -inf
+    refusal: str = ""
+
+
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
     """The owning instance of a process on a lost host, until a successor is assigned.
