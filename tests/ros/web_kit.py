@@ -68,9 +68,8 @@ class Gateway:
         """Send a request: GET, or POST with a body."""
         connection = http.client.HTTPConnection(*self.address, timeout=PATIENCE)
         given = {name.replace("_", "-"): value for name, value in headers.items()}
-        content = None
+        content = body if isinstance(body, (str, bytes)) else body and json.dumps(body)
         if body is not None:
-            content = json.dumps(body)
             given.setdefault("Content-Type", "application/json")
         try:
             connection.request("GET" if body is None else "POST", path, content, given)

@@ -3,18 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from fastapi import FastAPI
 
-from rosrm.model.applications import ApplicationRow
+from rosrm.model.applications import ApplicationRow, ApplyResult
 from rosrm.model.rows import EventRow, ProcessRow
 from rosrm.version import __version__
 from rosrm_web import problems
+from rosrm_web.acting import WORK_TYPES, Acting, Message
 from rosrm_web.reading import Host, Log, Reading, Status
 
 if TYPE_CHECKING:
     from rosrm_web.gateway import Gateway
+
+
+#: Body of a request with a work file, in OpenAPI.
+_WORK_FILE: Final = {
+    "description": "A work file, as docs/reference/configuration.md describes it.",
+    "required": True,
+    "content": {media_type: {"schema": {"type": "object"}} for media_type in WORK_TYPES},
+}
+_WITH_WORK_FILE: Final = frozenset({"/v1/submit", "/v1/apply", "/v1/plan"})
 
 
 class Route(NamedTuple):
@@ -28,7 +38,7 @@ class Route(NamedTuple):
 
 def routes(gateway: Gateway) -> list[Route]:
     """Return all routes."""
-    read = Reading(gateway)
+    read, act = Reading(gateway), Acting(gateway)
     return [
         Route("GET", "/v1/status", read.status, Status),
         Route("GET", "/v1/hosts", read.hosts, list[Host]),
@@ -37,6 +47,20 @@ def routes(gateway: Gateway) -> list[Route]:
         Route("GET", "/v1/events", read.events, list[EventRow]),
         Route("GET", "/v1/explain/{process}", read.explain, dict[str, Any]),
         Route("GET", "/v1/logs/{process}", read.logs, Log),
+        Route("POST", "/v1/submit", act.submit, Message),
+        Route("POST", "/v1/apply", act.apply, ApplyResult),
+        Route("POST", "/v1/plan", act.plan, ApplyResult),
+        Route("POST", "/v1/revert", act.revert, ApplyResult),
+        Route("POST", "/v1/cancel", act.cancel, Message),
+        Route("POST", "/v1/cancel-app", act.cancel_application, ApplyResult),
+        Route("POST", "/v1/restart", act.restart, Message),
+        Route("POST", "/v1/move", act.move, Message),
+        Route("POST", "/v1/checkpoint", act.checkpoint, Message),
+        Route("POST", "/v1/restore", act.restore, Message),
+        Route("POST", "/v1/cordon", act.cordon, Message),
+        Route("POST", "/v1/uncordon", act.uncordon, Message),
+        Route("POST", "/v1/drain", act.drain, Message),
+        Route("POST", "/v1/rebalance", act.rebalance, Message),
     ]
 
 
@@ -44,10 +68,14 @@ def create_app(gateway: Gateway) -> FastAPI:
     """Return the application; `guard.Guard` has to stand before it."""
     app = FastAPI(
         title="rosrm", version=__version__, openapi_url="/v1/openapi.json",
+        responses=problems.RESPONSES,
         docs_url=None, redoc_url=None,  # both load scripts from the internet
     )  # fmt: skip
     for method, path, endpoint, answer in routes(gateway):
-        app.add_api_route(path, endpoint, methods=[method], response_model=answer)
+        extra = {"requestBody": _WORK_FILE} if path in _WITH_WORK_FILE else None
+        app.add_api_route(
+            path, endpoint, methods=[method], response_model=answer, openapi_extra=extra
+        )
     for kind, handler in problems.HANDLERS.items():
         app.add_exception_handler(kind, handler)
     # The page is mounted here, below the same guard, with `gateway` as its source.

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _SEARCH = 2.0
 
 
-def web(  # noqa: PLR0917 - an argument for each option
+def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     ctx: typer.Context,
     listen: Annotated[
         str,
@@ -45,6 +45,15 @@ def web(  # noqa: PLR0917 - an argument for each option
         Path | None,
         typer.Option("--key", metavar="FILE", help="PEM file with its key, with mode 0600."),
     ] = None,
+    tokens: Annotated[
+        Path | None,
+        typer.Option(
+            "--tokens", metavar="FILE", help="Lines `ROLE NAME TOKEN`: nothing without a token."
+        ),
+    ] = None,
+    allow_actions: Annotated[
+        bool, typer.Option("--allow-actions", help="Let operators act; needs --tokens.")
+    ] = False,
     plain_http: Annotated[
         bool,
         typer.Option("--plain-http", help="Allow HTTP without TLS beyond this machine."),
@@ -57,19 +66,21 @@ def web(  # noqa: PLR0917 - an argument for each option
 ) -> None:
     """Serve the state of the cluster over HTTP until Ctrl-C.
 
-    The gateway is a client of the master, and only reads. It listens on 127.0.0.1:8290.
+    The gateway is a client of the master, on 127.0.0.1:8290, and by default only reads.
     """
     from rosrm_web.gateway import Gateway
     from rosrm_web.serving import open_socket, serve, url_of
 
     settings = checked(
-        listen, certificate=certificate, key=key, plain_http=plain_http, names=names or ()
-    )
+        listen, certificate=certificate, key=key, plain_http=plain_http, names=names or (),
+        tokens=tokens, allow_actions=allow_actions,
+    )  # fmt: skip
     _log_to_stderr()
     cluster = ctx.obj.cluster if isinstance(ctx.obj, CommonOptions) else None
     gateway = Gateway(partial(_connect, ros_settings(ctx, domain), cluster))
     with open_socket(settings) as listener:
-        said = f"rosrm web: {url_of(listener, settings)}/v1/status; it only reads"
+        rights = "operators may act" if settings.is_acting else "it only reads"
+        said = f"rosrm web: {url_of(listener, settings)}/v1/status; {rights}"
         serve(gateway, settings, listener, lambda: echo(said))
 
 

@@ -53,6 +53,10 @@ class Gateway:
         self._require_master()
         return await self._listings.get(**parts)
 
+    def forget_listings(self) -> None:
+        """Read everything again, because a request may have changed it."""
+        self._listings.forget()
+
     def _require_master(self) -> None:
         if self.watcher.master.state != "up":
             raise NoMaster(self.watcher.master.reason)

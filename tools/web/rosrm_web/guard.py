@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
+import logging
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm_web import problems
 from rosrm_web.settings import Settings
+from rosrm_web.tokens import ANYONE, User, user_of
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -39,17 +42,24 @@ _HEADERS: Final = {
 _WITH_TLS: Final = {b"strict-transport-security": b"max-age=31536000"}
 
 
+_log = logging.getLogger("rosrm.web")
+
+
 class Rejected(Exception):
     """A request that is answered without a look at its path.
 
     Args:
         status: HTTP status code.
         detail: sentence for the user.
+        headers: of the answer.
     """
 
-    def __init__(self, status: int, detail: str) -> None:
+    def __init__(
+        self, status: int, detail: str, headers: Mapping[str, str] = MappingProxyType({})
+    ) -> None:
         super().__init__(detail)
         self.status = status
+        self.headers = headers
 
 
 class Guard:
@@ -69,18 +79,46 @@ class Guard:
             headers = single_headers(scope["headers"])
             check_host(headers, self._settings.host_names)
             check_origin(scope, headers, self._settings.scheme)
+            user = self.user_of_request(scope, headers)
             if scope["type"] == "http":
                 receive = await _with_body(scope, headers, receive)
         except Rejected as error:
             await _reject(error, scope, receive, self._hardened(send))
             return
-        await self._app(scope, receive, self._hardened(send))
+        scope["user"] = user
+        acts = scope.get("method", "GET") not in _SAFE
+        note = f"{user.name}: {scope['method']} {scope['path']!r:.100}" if acts else ""
+        await self._app(scope, receive, self._hardened(send, note))
 
-    def _hardened(self, send: Send) -> Send:
-        """Return `send` with the headers of every answer; an application may set its own."""
+    def user_of_request(self, scope: Scope, headers: Mapping[str, str]) -> User:
+        """Return the user of a request; refuse it if the user may not send it."""
+        users = self._settings.users
+        user = user_of(headers.get("authorization", ""), users) if users else ANYONE
+        if user is None:
+            raise Rejected(
+                401, "the token is missing or wrong: `Authorization: Bearer TOKEN` is required",
+                {"www-authenticate": "Bearer"},
+            )  # fmt: skip
+        if scope.get("method", "GET") in _SAFE:
+            return user
+        if not self._settings.is_acting:
+            raise Rejected(
+                403, "this gateway only reads; `rosrm web --allow-actions --tokens FILE` acts, too"
+            )
+        if user.role != "operator":
+            raise Rejected(403, f"{user.name} is a {user.role}: only operators may act")
+        return user
+
+    def _hardened(self, send: Send, note: str = "") -> Send:
+        """Return `send` with the headers of every answer; an application may set its own.
+
+        With a note, the status of the answer is logged after it.
+        """
 
         async def send_hardened(message: Message) -> None:
             if message["type"] == "http.response.start":
+                if note:
+                    _log.info("%s: %d", note, message["status"])
                 given = list(message.get("headers", ()))
                 names = {name.lower() for name, _ in given}
                 ours = [one for one in self._headers.items() if one[0] not in names]
@@ -184,5 +222,5 @@ async def _reject(error: Rejected, scope: Scope, receive: Receive, send: Send) -
         await send({"type": "websocket.close", "code": 1008, "reason": str(error)[:100]})
         return
     # The rest of the request is not read: the connection must not be used again.
-    headers = {"connection": "close"}
+    headers = {**error.headers, "connection": "close"}
     await problems.answer(error.status, str(error), headers=headers)(scope, receive, send)

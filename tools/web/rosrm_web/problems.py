@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import dataclass
 from http import HTTPStatus
 from typing import Any, Final
 
 from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
+from pydantic import TypeAdapter
 from starlette.exceptions import HTTPException
 
 from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError, describe_fault
@@ -19,6 +21,31 @@ MEDIA_TYPE: Final = "application/problem+json"
 _STATUS: Final = {"unknown": 404, "denied": 403, "quota": 429, "invalid": 422, "unsure": 503}
 #: Errors in a parameter or body that one answer names.
 _MOST_FAULTS: Final = 10
+
+
+@dataclass
+class Problem:
+    """Answer to a request that failed (RFC 9457).
+
+    Attributes:
+        detail: sentence for the user.
+        code: the master's reason in one word; "": none.
+    """
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    code: str = ""
+
+
+#: Answers with errors, in OpenAPI.
+RESPONSES: Final[dict[Any, Any]] = {
+    "default": {
+        "description": "The request failed.",
+        "content": {MEDIA_TYPE: {"schema": TypeAdapter(Problem).json_schema()}},
+    }
+}
 
 _log = logging.getLogger("rosrm.web")
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import ipaddress
 import socket
 import ssl
-import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from rosrm.errors import ConfigError
+from rosrm_web.private_files import check_private
+from rosrm_web.tokens import User, read_tokens
 
 DEFAULT_LISTEN: Final = "127.0.0.1:8290"
 DEFAULT_PORT: Final = 8290
-_OTHERS: Final = 0o077
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Settings:
         certificate: path of the certificate chain; None: plain HTTP.
         key: path of its private key; None: in the file of the certificate.
         names: further names of this machine that a request may address.
+        users: users with tokens; (): everyone may read.
+        is_acting: requests of operators act; otherwise the gateway only reads.
     """
 
     address: str = "127.0.0.1"
@@ -35,6 +37,8 @@ class Settings:
     certificate: Path | None = None
     key: Path | None = None
     names: tuple[str, ...] = ()
+    users: tuple[User, ...] = ()
+    is_acting: bool = False
 
     @property
     def scheme(self) -> str:
@@ -49,7 +53,8 @@ class Settings:
 
 def checked(
     listen: str, *, certificate: Path | None = None, key: Path | None = None,
-    plain_http: bool = False, names: Sequence[str] = (),
+    plain_http: bool = False, names: Sequence[str] = (), tokens: Path | None = None,
+    allow_actions: bool = False,
 ) -> Settings:  # fmt: skip
     """Return the settings of the command.
 
@@ -59,6 +64,8 @@ def checked(
         key: path of a PEM file with its private key; None: in the file of the certificate.
         plain_http: allow HTTP without TLS on an address that other machines can reach.
         names: further names of this machine.
+        tokens: path of the file with the tokens; None: everyone may read.
+        allow_actions: let operators act.
 
     Raises:
         ConfigError: an option is invalid, or the settings would send tokens and logs unencrypted.
@@ -73,7 +80,18 @@ def checked(
             f"--listen {listen}: other machines can reach this address, and plain HTTP is not "
             "encrypted. Give --certificate FILE (and --key FILE), or allow it: --plain-http"
         )
-    return Settings(address, port, certificate, key, tuple(names))
+    users = () if tokens is None else read_tokens(tokens)
+    if not users and not ipaddress.ip_address(address).is_loopback:
+        raise ConfigError(
+            f"--listen {listen}: other machines can reach this address, and could read everything. "
+            "Give a file with tokens: --tokens FILE"
+        )
+    if allow_actions and not any(user.role == "operator" for user in users):
+        raise ConfigError(
+            "--allow-actions: only users with a token of an operator may act: give --tokens FILE "
+            "with a line `operator NAME TOKEN`"
+        )
+    return Settings(address, port, certificate, key, tuple(names), users, allow_actions)
 
 
 def _address(listen: str) -> tuple[str, int]:
@@ -109,17 +127,3 @@ def _check_tls(certificate: Path, key: Path | None) -> None:
 
 def _no_password() -> str:
     raise ValueError("the key has a password; store it without one, readable by its owner only")
-
-
-def check_private(option: str, path: Path) -> None:
-    """Refuse a file with a secret that is missing, or that other users can read."""
-    try:
-        state = path.stat()
-    except OSError as error:
-        raise ConfigError(f"{option} {path}: cannot be read: {error.strerror}") from None
-    if not stat.S_ISREG(state.st_mode):
-        raise ConfigError(f"{option} {path}: a file is required")
-    if stat.S_IMODE(state.st_mode) & _OTHERS:
-        raise ConfigError(
-            f"{option} {path}: other users can read or change it; `chmod 600 {path}` ends that"
-        )

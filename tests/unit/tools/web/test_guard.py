@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+from hashlib import sha256
 
 import pytest
 
 from rosrm_web import guard
 from rosrm_web.settings import Settings
+from rosrm_web.tokens import User
 
+TOKEN = "o" * 24
+#: A gateway with one operator, who sends all requests that act.
+ACTING = Settings(users=(User("ada", "operator", sha256(TOKEN.encode()).digest()),), is_acting=True)
 NAMES = frozenset({"localhost", "robot-1"})
 
 
 def scope(method="GET", kind="http", **headers):
+    headers = {"authorization": f"Bearer {TOKEN}", **headers}
     listed = [(name.replace("_", "-").encode(), value.encode()) for name, value in headers.items()]
     return {"type": kind, "method": method, "path": "/", "headers": listed}
 
@@ -42,7 +48,7 @@ def request(wanted, *parts, app=None):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guard.Guard(app or Seen(), Settings())(wanted, receive, send))
+    asyncio.run(guard.Guard(app or Seen(), ACTING)(wanted, receive, send))
     return sent[0]
 
 
@@ -131,7 +137,7 @@ def test_a_body_that_never_ends_is_refused(monkeypatch):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guard.Guard(Seen(), Settings())(scope("POST", host="localhost"), never, send))
+    asyncio.run(guard.Guard(Seen(), ACTING)(scope("POST", host="localhost"), never, send))
     assert sent[0]["status"] == 408
 
 
