@@ -13,6 +13,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.rescheduling import allow_every_host
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.values import ProcessSpec
 from rosrm.wording import duration, words
 
 #: Seconds after its time from which on a run counts as late.
@@ -26,6 +27,22 @@ def await_first_run(state: MasterState, process: Process, now: float) -> bool:
     process.next_run = process.spec.schedule.next_run(state.wall)
     state.set_phase(process, ProcessPhase.SCHEDULED, now)
     return True
+
+
+def change_between_runs(
+    state: MasterState, process: Process, spec: ProcessSpec, now: float
+) -> None:
+    """Replace the spec of a job that waits for its next run; without a schedule it starts now."""
+    former, schedule = process.spec.schedule, spec.schedule
+    state.set_spec(process, spec)
+    if not schedule:
+        process.next_run = 0.0
+        state.enqueue(process, now)
+    elif former.every and schedule.every:  # counted from its last start
+        process.next_run += schedule.every - former.every
+    elif former != schedule:
+        process.next_run = schedule.next_run(state.wall)
+    state.save(process)
 
 
 def review_schedules(state: MasterState, now: float) -> None:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
+import pytest
+
 from rosrm.core.master import listing
 from rosrm.model.schedules import Schedule
 from rosrm.model.values import HostLossPolicy, ReschedulePolicy, RestartPolicy
 from tests.unit.core.cluster import Cluster, job
+from tests.unit.core.test_applications import program
 
 EVERY_10_S = Schedule(every=10.0)
 
@@ -189,3 +192,36 @@ def test_a_job_that_no_host_can_start_waits_for_its_next_run() -> None:
     cluster.machines["a"].refuses.clear()
     cluster.wait(10.5)
     assert cluster.phase("p") == "running"
+
+
+@pytest.mark.parametrize(
+    ("schedule", "waits"),
+    [(EVERY_10_S, 7.0), (Schedule(every=20.0), 17.0), (Schedule(every=4.0), 1.0)],
+    ids=["the same interval", "a longer one", "a shorter one"],
+)
+def test_a_job_that_changes_between_two_runs_waits_for_the_next_one(
+    schedule: Schedule, waits: float
+) -> None:
+    """The interval counts from its last start; the next run has the new spec."""
+    cluster = Cluster("a")
+    cluster.apply("app", job("p", schedule=EVERY_10_S))
+    cluster.wait(3.0)
+    cluster.finish("p")
+    assert cluster.apply("app", job("p", command=("new",), schedule=schedule)).accepted
+    cluster.wait(waits - 0.5)
+    assert (cluster.phase("p"), starts(cluster)) == ("scheduled", 1)
+    cluster.wait(1.0)
+    assert (program(cluster, "p"), starts(cluster)) == (("new",), 2)
+
+
+def test_a_job_that_loses_its_schedule_between_two_runs_runs_once() -> None:
+    """It is a job like any other from then on."""
+    cluster = Cluster("a")
+    cluster.apply("app", job("p", schedule=EVERY_10_S))
+    cluster.finish("p")
+    cluster.apply("app", job("p"))
+    cluster.wait(1.0)
+    assert starts(cluster) == 2
+    cluster.finish("p")
+    cluster.wait(15.0)
+    assert (cluster.phase("p"), starts(cluster)) == ("finished", 2)

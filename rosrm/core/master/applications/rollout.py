@@ -38,7 +38,7 @@ from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.dependants import dependants_first
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import add_process, still_stopping
-from rosrm.core.master.schedules import await_first_run
+from rosrm.core.master.schedules import change_between_runs
 from rosrm.core.master.state.applications import Application, Task
 from rosrm.core.master.state.process import (
     WAITING,
@@ -209,9 +209,7 @@ def _replace(
         process.next_spec = spec
         state.enqueue(process, now)
     elif process.phase is ProcessPhase.SCHEDULED:
-        state.set_spec(process, spec)
-        if not await_first_run(state, process, now):
-            state.enqueue(process, now)
+        change_between_runs(state, process, spec, now)
     elif process.phase in _STARTED and process.wanted is DesiredState.RUN:
         cause = f"version {application.wanted} of {application.name}"
         refusal = try_replace(state, process, spec, cause, now)
