@@ -75,6 +75,11 @@ def differences(planned: ApplyResult, now: ApplyResult) -> list[str]:
     Raises:
         Refused: the work differs, or what is to be done with a process of it.
     """
+    if planned.mode != now.mode:
+        raise Refused(
+            f"the plan is one of {_subject(planned)}, and the request is one of {_subject(now)}. "
+            f"Nothing was changed"
+        )
     if planned.work != now.work:
         raise Refused("the work differs from that of the plan; plan again. Nothing was changed")
     others = _compared(planned.actions, now.actions, _what)
@@ -84,6 +89,10 @@ def differences(planned: ApplyResult, now: ApplyResult) -> list[str]:
             f"Plan again. Nothing was changed"
         )
     return _compared(planned.actions, now.actions, _text)
+
+
+def _subject(plan: ApplyResult) -> str:
+    return f"the mode {plan.mode}" if plan.mode else "applications"
 
 
 def elsewhere(actions: Iterable[PlannedAction], rows: Iterable[ProcessRow]) -> list[str]:

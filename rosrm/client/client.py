@@ -179,7 +179,7 @@ class Client:
         # Listed first: a mode that is loaded between the two requests differs from this digest.
         digests = {row.name: row.digest for row in self.list_modes()}
         planned = self._master.switch_mode(mode, plan_only=True)
-        return replace(planned, work=digests.get(mode, ""))
+        return replace(planned, work=digests.get(mode, ""), mode=mode)
 
     def list_modes(self) -> Sequence[ModeRow]:
         """Return all modes, in the order of their file."""

@@ -101,11 +101,13 @@ class ApplyResult:
         actions: actions that follow, or would follow; (): everything is as desired.
         work: digest of the requested work, which tells a plan from that of other work; "": unknown,
             as in the answer to a switch of modes that is not a plan.
+        mode: name of the mode of a plan; "": it is one of applications.
     """
 
     message: str
     actions: tuple[PlannedAction, ...] = ()
     work: str = ""
+    mode: str = ""
 
     @property
     def versions(self) -> Mapping[str, int]:

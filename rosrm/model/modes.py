@@ -70,7 +70,8 @@ class ModeRow:
         weights: resource to its weight, 0 to 1, in the scoring policies; empty: the weights of the
             cluster.
         when: condition that puts it into force; "": none.
-        reason: why it was left, or not reached, when this was tried last; "": it was not.
+        reason: why it was left, or not reached, when this was tried last; or which of its
+            applications have changed since it is in force.
         digest: digest of its contents; another one: the mode was loaded with other contents since.
     """
 

@@ -126,6 +126,28 @@ def test_a_plan_of_other_work_begins_nothing(master, rosrm, work, command, kept)
     assert "the work differs from that of the plan; plan again" in result.err
 
 
+@pytest.mark.parametrize(
+    ("planned", "requested", "said"),
+    [
+        (("mode", "docked"), ("mode", "exploring"), "the mode docked|the mode exploring"),
+        (("revert", "nav"), ("mode", "docked"), "applications|the mode docked"),
+        (("mode", "docked"), ("revert", "nav"), "the mode docked|applications"),
+    ],
+)
+def test_a_plan_of_another_mode_names_both(master, rosrm, tmp_path, planned, requested, said):
+    """The refusal says which file was given by mistake."""
+    master.modes = [DOCKED, replace(DOCKED, name="exploring", state="", digest="two")]
+    kept = tmp_path / "kept.plan"
+    kept.write_text(rosrm(*planned, "--plan", "--json").out)
+    result = rosrm(*requested, "--as-planned", kept)
+    assert (result.code, "apply" in requests(master)) == (1, False)
+    this, other = said.split("|")
+    assert result.err == (
+        f"rosrm: the plan is one of {this}, and the request is one of {other}. Nothing was "
+        f"changed\n"
+    )
+
+
 def test_what_other_readings_change_is_said(master, rosrm, command, kept):
     """Hosts, waits and moves of other processes: before the work begins, and at its end."""
     move = PlannedAction("other", Action.MOVE, "", "beta", "alpha")

@@ -15,7 +15,7 @@ from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.modes import Mode, Trigger
 from rosrm.model.values import HostLossPolicy, ProcessSpec, StartOrder
 from tests.unit.core.cluster import Cluster, Eq1, Machine, job, movable, process
-from tests.unit.core.test_applications import actions, new
+from tests.unit.core.test_applications import actions, new, row
 
 
 def target(name: str, *specs: ProcessSpec, **rollout: Any) -> Target:
@@ -319,6 +319,30 @@ def test_the_weights_of_a_mode_apply_while_it_is_in_force() -> None:
 
 
 # --- loading ----------------------------------------------------------------------------------
+
+
+def test_a_mode_says_which_of_its_applications_have_changed_since() -> None:
+    """It stays in force, also after a restart of the master; the same request restores it."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    why = "map was cancelled since; `rosrm mode exploring` applies the mode again"
+    assert cluster.apply("map").accepted
+    cluster.wait(2.0)
+    for _ in range(2):
+        (listed, _docked) = mode_rows(cluster.state)
+        assert (listed.state, listed.reason) == ("in force", why)
+        application = row(cluster, "map")
+        assert (application.state, application.reason) == (
+            "cancelled", "the mode exploring has it: `rosrm mode exploring` applies it again"
+        )  # fmt: skip
+        cluster.restart_master()
+        cluster.wait(1.0)
+    cluster.apply("nav", new(process("planner")), process("driver"))
+    cluster.wait(5.0)
+    (listed, _docked) = mode_rows(cluster.state)
+    assert listed.reason.startswith("nav was changed since and map was cancelled since; ")
+    assert switch(cluster, "exploring", 6.0).accepted
+    assert running(cluster) == {"planner", "driver", "mapper"}
+    assert mode_rows(cluster.state)[0].reason == row(cluster, "map").reason == ""
 
 
 def test_the_mode_in_force_cannot_be_removed() -> None:

@@ -32,9 +32,21 @@ def _row(state: MasterState, application: Application) -> ApplicationRow:
     return ApplicationRow(
         application.name, application.principal, condition, application.wanted,
         len(application.specs), len(application.specs) - len(unwell), pending,
-        application.paused or ("" if condition != "degraded" else "; ".join(few(first))),
+        _reason(state, application, condition, first),
         tuple(_version_row(application, one) for one in application.versions.values()),
     )  # fmt: skip
+
+
+def _reason(
+    state: MasterState, application: Application, condition: ApplicationState, unwell: list[str]
+) -> str:
+    """Return why an application is not as desired, or which mode has it although cancelled."""
+    mode = state.modes.mode
+    if condition == "degraded":
+        return "; ".join(few(unwell))
+    if condition == "cancelled" and mode is not None and application.name in mode.applications:
+        return f"the mode {mode.name} has it: `rosrm mode {mode.name}` applies it again"
+    return application.paused
 
 
 def unknown_processes(state: MasterState, application: Application) -> dict[str, str]:

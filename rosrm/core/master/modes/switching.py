@@ -279,8 +279,27 @@ def mode_rows(state: MasterState) -> Sequence[ModeRow]:
     return [
         ModeRow(
             mode.name, in_force if mode.name == modes.wanted else "", mode.applications,
-            mode.limits, mode.weights, str(mode.when), modes.fault.get(mode.name, ""),
-            mode.digest,
+            mode.limits, mode.weights, str(mode.when), _why(state, mode), mode.digest,
         )
         for mode in modes.known.values()
     ]  # fmt: skip
+
+
+def _why(state: MasterState, mode: Mode) -> str:
+    """Return why a mode was left or not reached, or what was changed since it is in force."""
+    modes = state.modes
+    if mode.name != modes.wanted or modes.switching or mode.name in modes.fault:
+        return modes.fault.get(mode.name, "")
+    changes = [
+        f"{name} was {'changed' if version else 'cancelled'} since"
+        for name in mode.applications
+        if (version := _version_of(state, name)) != modes.versions.get(name)
+    ]
+    again = f"; `rosrm mode {mode.name}` applies the mode again"
+    return f"{listed(changes)}{again}" if changes else ""
+
+
+def _version_of(state: MasterState, name: str) -> int:
+    """Return the number of the desired version of an application; 0: there is none."""
+    application = state.applications.get(name)
+    return 0 if application is None else application.wanted
