@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
+from contextlib import ExitStack
 from typing import Any
 
 import pytest
 from pydantic import TypeAdapter
 
 from rosrm_web.app import routes
+from rosrm_web.changes import MOST_READERS
 from rosrm_web.gateway import Gateway
 from tests.ros.clusters import host, job, service
 from tests.ros.web_kit import gateway
@@ -28,13 +31,14 @@ def cluster(make_shared):
 @pytest.fixture(scope="module")
 def web(cluster):
     """Return a gateway that only reads."""
-    with gateway(cluster) as one:
+    with gateway(cluster.ros) as one:
         yield one
 
 
 def answers() -> dict[str, Any]:
     """Return the types of the answers of all GET routes, by path."""
-    return {one.path: one.answer for one in routes(Gateway(None)) if one.method == "GET"}
+    listed = [one for one in routes(Gateway(None)) if one.method == "GET" and one.answer]
+    return {one.path: one.answer for one in listed}
 
 
 @pytest.mark.parametrize("path", answers())
@@ -92,25 +96,62 @@ def test_a_foreign_host_name_is_refused(web):
     assert web.ask("/v1/status", Host="evil.example").status == 421
 
 
+def test_changes_are_streamed_as_they_happen(cluster, web):
+    """The stream begins with the master's state, then has each new event once, in order."""
+    with web.follow() as changes:
+        assert next(changes).kind == "master"
+        cluster.run(job("short", "true"))
+        seen = list(itertools.takewhile(lambda one: one.data["kind"] != "finished", changes))
+    assert [one.data["kind"] for one in seen][:2] == ["submitted", "assigned"]
+    assert sorted({one.number for one in seen}) == [one.number for one in seen]
+
+    with web.follow(**{"Last-Event-ID": str(seen[0].number)}) as again:
+        assert [one.kind for one in itertools.islice(again, 2)] == ["master", "event"]
+        assert next(again).number == seen[2].number
+
+
+def test_too_many_readers_of_changes_are_refused(web):
+    """The next one gets a sentence, and a place is free when a reader has left."""
+    with ExitStack() as stack:
+        for _ in range(MOST_READERS):
+            next(stack.enter_context(web.follow()))
+        answer = web.ask("/v1/changes")
+        assert (answer.status, "readers" in answer.json["detail"]) == (503, True)
+
+    def follow() -> bool:
+        try:
+            with web.follow() as changes:
+                return next(changes).kind == "master"
+        except AssertionError:
+            return False
+
+    wait_until(follow, "a place for a reader is free again")
+
+
 def test_the_gateway_says_that_the_master_is_lost_and_finds_the_next_one(make_cluster):
-    """Without a master the gateway stays, answers 503 with a reason, and recovers alone."""
+    """Without a master the gateway answers 503 with the reason, and recovers alone."""
     made = make_cluster(host("robot-1"))
-    with gateway(made) as web:
+    with gateway(made.ros) as web:
         web.wait_for_master("up")
-        made.end(made.master, signal.SIGKILL)
-        web.wait_for_master("lost")
+        with web.follow() as changes:
+            assert next(changes) == ("master", 0, {"state": "up", "reason": ""})
+            made.end(made.master, signal.SIGKILL)
+            lost = next(one.data for one in changes if one.kind == "master")
+            assert (lost["state"], "not answered" in lost["reason"]) == ("lost", True)
         answer = web.ask("/v1/processes")
         assert (answer.status, "master" in answer.json["detail"]) == (503, True)
 
-        made.reconnect()
-        made.start_master()
-        web.wait_for_master("up")
+        with web.follow() as changes:
+            assert next(changes).data["state"] == "lost"
+            made.reconnect()
+            made.start_master()
+            assert next(one.data["state"] for one in changes if one.kind == "master") == "up"
         wait_until(lambda: web.ask("/v1/hosts").status == 200, "the hosts are listed again")
 
 
 def test_nothing_notices_the_death_of_a_gateway(cluster):
     """The master and its slaves work as before."""
-    with gateway(cluster) as web:
+    with gateway(cluster.ros) as web:
         web.wait_for_master("up")
         assert web.end(signal.SIGKILL) == -signal.SIGKILL
         cluster.run(job("after", "true"))

@@ -26,7 +26,7 @@ def web(cluster):
     file = cluster.directory / "tokens"
     file.touch(0o600)
     file.write_text(f"operator ada {OPERATOR}\nviewer eve {VIEWER}\n")
-    with gateway(cluster, "--tokens", str(file), "--allow-actions") as one:
+    with gateway(cluster.ros, "--tokens", str(file), "--allow-actions") as one:
         yield one
 
 

@@ -6,16 +6,17 @@ import http.client
 import json
 import os
 import signal
+import ssl
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import urlsplit
 
-from tests.ros.clusters import Cluster
+from rosrm.model.ros_settings import RosSettings
 from tests.waiting import PATIENCE, wait_until
 
 
@@ -32,6 +33,14 @@ class Answer:
         return json.loads(self.body)
 
 
+class Change(NamedTuple):
+    """A server-sent event; number 0: it has no id."""
+
+    kind: str
+    number: int
+    data: Any
+
+
 class Gateway:
     """A running `rosrm web`.
 
@@ -39,10 +48,11 @@ class Gateway:
         url: address that the command printed.
     """
 
-    def __init__(self, cluster: Cluster, *words: str) -> None:
+    def __init__(self, ros: RosSettings, *words: str, tls: ssl.SSLContext | None = None) -> None:
+        self._tls = tls
         self.process = subprocess.Popen(
             [sys.executable, "-m", "rosrm.cli", "web", "--listen", "127.0.0.1:0", *words],
-            env={**os.environ, **cluster.ros.environment(), "PYTHONUNBUFFERED": "1"},
+            env={**os.environ, **ros.environment(), "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         self.said: list[str] = []
@@ -64,9 +74,14 @@ class Gateway:
         parts = urlsplit(self.url)
         return str(parts.hostname), int(parts.port or 0)
 
+    def _connection(self) -> http.client.HTTPConnection:
+        if self._tls is None:
+            return http.client.HTTPConnection(*self.address, timeout=PATIENCE)
+        return http.client.HTTPSConnection(*self.address, timeout=PATIENCE, context=self._tls)
+
     def ask(self, path: str, body: object = None, **headers: str) -> Answer:
         """Send a request: GET, or POST with a body."""
-        connection = http.client.HTTPConnection(*self.address, timeout=PATIENCE)
+        connection = self._connection()
         given = {name.replace("_", "-"): value for name, value in headers.items()}
         content = body if isinstance(body, (str, bytes)) else body and json.dumps(body)
         if body is not None:
@@ -84,6 +99,19 @@ class Gateway:
         assert answer.status == 200, answer
         return answer.json
 
+    @contextmanager
+    def follow(self, path: str = "/v1/changes", **headers: str) -> Iterator[Iterator[Change]]:
+        """Yield an iterator over server-sent events."""
+        connection = self._connection()
+        try:
+            connection.request("GET", path, headers=headers)
+            answer = connection.getresponse()
+            assert answer.status == 200, answer.read()
+            assert answer.headers["content-type"].startswith("text/event-stream")
+            yield _changes(answer)
+        finally:
+            connection.close()
+
     def wait_for_master(self, state: str) -> None:
         wait_until(
             lambda: self.get("/v1/status")["gateway"]["state"] == state,
@@ -97,10 +125,21 @@ class Gateway:
         return self.process.wait(PATIENCE)
 
 
+def _changes(lines: Iterable[bytes]) -> Iterator[Change]:
+    fields: dict[str, str] = {}
+    for line in lines:
+        name, mark, value = line.decode().rstrip("\n").partition(": ")
+        if mark:
+            fields[name] = value
+        elif fields:
+            yield Change(fields["event"], int(fields.get("id", 0)), json.loads(fields["data"]))
+            fields = {}
+
+
 @contextmanager
-def gateway(cluster: Cluster, *words: str) -> Iterator[Gateway]:
+def gateway(ros: RosSettings, *words: str, tls: ssl.SSLContext | None = None) -> Iterator[Gateway]:
     """Yield a gateway that ends afterwards, with success and without a traceback."""
-    one = Gateway(cluster, *words)
+    one = Gateway(ros, *words, tls=tls)
     try:
         yield one
     finally:

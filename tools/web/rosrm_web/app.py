@@ -12,6 +12,7 @@ from rosrm.model.rows import EventRow, ProcessRow
 from rosrm.version import __version__
 from rosrm_web import problems
 from rosrm_web.acting import WORK_TYPES, Acting, Message
+from rosrm_web.changes import Changes
 from rosrm_web.reading import Host, Log, Reading, Status
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ def routes(gateway: Gateway) -> list[Route]:
         Route("GET", "/v1/processes", read.processes, list[ProcessRow]),
         Route("GET", "/v1/apps", read.applications, list[ApplicationRow]),
         Route("GET", "/v1/events", read.events, list[EventRow]),
+        Route("GET", "/v1/changes", Changes(gateway).follow, None),
         Route("GET", "/v1/explain/{process}", read.explain, dict[str, Any]),
         Route("GET", "/v1/logs/{process}", read.logs, Log),
         Route("POST", "/v1/submit", act.submit, Message),

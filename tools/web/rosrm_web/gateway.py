@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rosrm.errors import NoMaster
+from rosrm_web.changes import Broadcast, master_part
 from rosrm_web.listings import Listings
 from rosrm_web.master_link import MasterLink
 from rosrm_web.watching import Watcher
@@ -29,6 +30,7 @@ class Gateway:
         acting: requests that act, and explanations.
         logs: logs, which the slaves send.
         watcher: knows if the master answers.
+        broadcast: passes changes to those who follow them.
     """
 
     def __init__(self, connect: Callable[[Notify], Client]) -> None:
@@ -37,6 +39,9 @@ class Gateway:
         self.logs = MasterLink("logs", connect)
         self.watcher = Watcher(self.reading)
         self._listings = Listings(self.reading)
+        self.broadcast = Broadcast()
+        self.watcher.on_events.append(self.broadcast.send_events)
+        self.watcher.on_master.append(lambda master: self.broadcast.send(master_part(master)))
 
     async def ask(self, link: MasterLink, request: Callable[[Client], T]) -> T:
         """Return the result of a request; without a master, refuse it at once.

@@ -15,7 +15,7 @@ from rosrm.client.logs import LogSelection
 from rosrm.errors import NoMaster
 from rosrm.model.rows import HostRow, PluginRow
 from rosrm.model.values import HostDescription
-from rosrm_web.watching import give_up_early
+from rosrm_web.watching import MOST_EVENTS, give_up_early
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from rosrm_web.gateway import Gateway
     from rosrm_web.master_link import MasterLink
 
-#: Most events of one answer.
-MOST_EVENTS: Final = 1000
 #: Most last lines of a log in one answer.
 MOST_LINES: Final = 10_000
 #: Bytes of a log in one answer, after which no further chunk is added.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
@@ -12,11 +13,13 @@ from rosrm.errors import NoMaster, RosrmError
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
-    from rosrm.model.rows import Listing
+    from rosrm.model.rows import EventRow, Listing
     from rosrm_web.master_link import MasterLink
 
 #: Seconds between two requests to the master.
 PERIOD: Final = 0.5
+#: Most new events of one request; if there are more, the oldest are left out.
+MOST_EVENTS: Final = 1000
 #: Seconds without an answer after which the master counts as lost.
 SILENCE: Final = 2.0
 
@@ -52,12 +55,16 @@ class Watcher:
 
     Attributes:
         master: newest known state of the master.
+        on_master: called with each new state of the master.
+        on_events: called with new events, the oldest first.
     """
 
     def __init__(self, link: MasterLink) -> None:
         self._link = link
         self._after = -1
         self.master = MasterState()
+        self.on_master: list[Callable[[MasterState], None]] = []
+        self.on_events: list[Callable[[Sequence[EventRow]], None]] = []
 
     async def run(self) -> None:
         """Ask until the task is cancelled."""
@@ -76,13 +83,20 @@ class Watcher:
             raise
         self._set_master(MasterState("up", ""))
         self._after = listing.last_sequence
+        for call in self.on_events if listing.events else ():
+            call(listing.events)
 
     def _list(self, client: Client) -> Listing:
         if self._after < 0:  # the events before the first request are no changes
             return client.list(on_wait=give_up_early)
-        return client.list(events=True, after=self._after, on_wait=give_up_early)
+        return client.list(
+            events=True, after=self._after, newest=MOST_EVENTS, on_wait=give_up_early
+        )
 
     def _set_master(self, master: MasterState) -> None:
-        if master.state != self.master.state:
-            _log.info("master is %s%s", master.state, f": {master.reason}" if master.reason else "")
+        is_new = master.state != self.master.state
         self.master = master
+        if is_new:
+            _log.info("master is %s%s", master.state, f": {master.reason}" if master.reason else "")
+            for call in self.on_master:
+                call(master)
