@@ -42,6 +42,7 @@ Plugins         hookimpl, NoOptions, SkipPlugin
                 SetLifecycle, Commit, Execute, HandoffPhase, InstanceId
   checkpoints   CheckpointOffer, CheckpointPolicy, CheckpointView, CheckpointChoice, MemoryPacing,
                 MemoryView
+  event sinks   SinkOffer, EventSink, Notice, NoticesRefused
   options       Seconds, PositiveSeconds, Bytes, Fraction, Count, PositiveCount, Amount,
                 ResourceName
 Errors          RosrmError, ConfigError, PluginError, Refused, NoMaster
@@ -114,6 +115,7 @@ if TYPE_CHECKING:
     from rosrm.extensions.hookspecs import hookimpl
     from rosrm.extensions.link_views import FlowView, LinkView
     from rosrm.extensions.options import options_of
+    from rosrm.extensions.sinks import EventSink, NoticesRefused, SinkOffer
     from rosrm.extensions.units import (
         Amount,
         Bytes,
@@ -137,6 +139,7 @@ if TYPE_CHECKING:
     from rosrm.model.artifacts import Artifact
     from rosrm.model.devices import Device, DeviceNeed
     from rosrm.model.modes import ModeRow
+    from rosrm.model.notices import Notice
     from rosrm.model.plan import (
         AwaitReady,
         AwaitReleased,
@@ -191,21 +194,21 @@ __all__ = [
     "ArrayMembership", "Artifact", "AwaitReady", "AwaitReleased", "BoolArray", "Bytes",
     "Capabilities", "CheckpointChoice", "CheckpointOffer", "CheckpointPolicy", "CheckpointView",
     "Client", "Commit", "ConfigError", "Configure", "Count", "Device", "DeviceFinding",
-    "DeviceNeed", "DeviceRow", "EventRow", "Execute", "FilterOffer", "FloatArray", "FlowView",
-    "Fraction", "GraphDepartureLauncher", "GroupMembership", "HandoffPhase", "Health",
+    "DeviceNeed", "DeviceRow", "EventRow", "EventSink", "Execute", "FilterOffer", "FloatArray",
+    "FlowView", "Fraction", "GraphDepartureLauncher", "GroupMembership", "HandoffPhase", "Health",
     "HostChecking", "HostDescription", "HostLabelling", "HostLossPolicy", "HostRow", "HostView",
     "ImageLauncher", "Imaging", "InstanceId", "IsolationPolicy", "Kind", "Launch", "Launcher",
     "LauncherContext", "LauncherOffer", "LinkView", "Listing", "LogChunk", "MemoryPacing",
     "MemoryView", "MigrationOffer", "MigrationPolicy", "MigrationStrategy", "ModeRow", "Move",
-    "NeighbourRule", "NoMaster", "NoOptions", "PeriodicImaging", "PlacementFilter", "Plan",
-    "PlannedAction", "PluginError", "PluginRow", "PositiveCount", "PositiveSeconds", "Probe",
-    "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow", "ProcessSpec",
-    "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused", "ReschedulePolicy",
-    "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy", "RolloutPolicy",
-    "RosSettings", "RosrmError", "Schedule", "Scores", "ScoringOffer", "ScoringPolicy",
-    "Seconds", "Sessions", "SetLifecycle", "SetRestart", "SkipPlugin", "SpecChecking",
-    "StandbyPolicy", "Start", "StartOrder", "Step", "Stop", "StopPolicy", "Target", "VersionRow",
-    "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
+    "NeighbourRule", "NoMaster", "NoOptions", "Notice", "NoticesRefused", "PeriodicImaging",
+    "PlacementFilter", "Plan", "PlannedAction", "PluginError", "PluginRow", "PositiveCount",
+    "PositiveSeconds", "Probe", "ProbeContext", "ProbeOffer", "ProcessMeasuring", "ProcessRow",
+    "ProcessSpec", "ProcessTreeLauncher", "ProcessView", "Readiness", "Reading", "Refused",
+    "ReschedulePolicy", "ResourceDescription", "ResourceName", "ResourceRow", "RestartPolicy",
+    "RolloutPolicy", "RosSettings", "RosrmError", "Schedule", "Scores", "ScoringOffer",
+    "ScoringPolicy", "Seconds", "Sessions", "SetLifecycle", "SetRestart", "SinkOffer", "SkipPlugin",
+    "SpecChecking", "StandbyPolicy", "Start", "StartOrder", "Step", "Stop", "StopPolicy", "Target",
+    "VersionRow", "WaitResult", "__version__", "hookimpl", "load_work", "options_of",
 ]  # fmt: skip
 
 #: The public names of each module below `rosrm`.
@@ -226,6 +229,7 @@ _NAMES: Final = {
     "extensions.hookspecs": "hookimpl",
     "extensions.link_views": "FlowView LinkView",
     "extensions.options": "options_of",
+    "extensions.sinks": "EventSink NoticesRefused SinkOffer",
     "extensions.units": (
         "Amount Bytes Count Fraction PositiveCount PositiveSeconds ResourceName Seconds"
     ),
@@ -236,6 +240,7 @@ _NAMES: Final = {
     "model.artifacts": "Artifact",
     "model.devices": "Device DeviceNeed",
     "model.modes": "ModeRow",
+    "model.notices": "Notice",
     "model.plan": (
         "AwaitReady AwaitReleased Commit Configure Execute HandoffPhase Move Plan "
         "SetLifecycle SetRestart Start Step Stop"

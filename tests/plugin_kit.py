@@ -15,6 +15,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.registry import Registry
+from rosrm.extensions.sinks import SinkOffer
 
 HOOKS: Final = {
     CheckpointOffer: "register_checkpoint_policies",
@@ -23,6 +24,7 @@ HOOKS: Final = {
     MigrationOffer: "register_migration_strategies",
     ProbeOffer: "register_probes",
     ScoringOffer: "register_scoring_policies",
+    SinkOffer: "register_event_sinks",
 }
 
 

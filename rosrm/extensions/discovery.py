@@ -34,6 +34,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.installed import GROUP, PluginAddress
+from rosrm.extensions.sinks import SinkOffer
 from rosrm.extensions.time_limit import limited
 from rosrm.model.rows import PluginKind
 from rosrm.wording import get_close_matches
@@ -41,7 +42,7 @@ from rosrm.wording import get_close_matches
 T = TypeVar("T")
 #: Offers that the configuration chooses by name, with options.
 ChosenOffer: TypeAlias = (
-    "ProbeOffer | ScoringOffer | FilterOffer | MigrationOffer | CheckpointOffer"
+    "ProbeOffer | ScoringOffer | FilterOffer | MigrationOffer | CheckpointOffer | SinkOffer"
 )
 Offer: TypeAlias = "ChosenOffer | LauncherOffer"
 
@@ -53,6 +54,7 @@ HOOKS: Final[Mapping[str, tuple[PluginKind, type[Any]]]] = {
     "register_migration_strategies": ("migration", MigrationOffer),
     "register_checkpoint_policies": ("checkpoint", CheckpointOffer),
     "register_launchers": ("launcher", LauncherOffer),
+    "register_event_sinks": ("sink", SinkOffer),
 }
 
 #: Seconds after which a warning names a plugin that is still being loaded.

@@ -26,6 +26,7 @@ from rosrm.extensions.contracts import (
     ScoringOffer,
 )
 from rosrm.extensions.installed import GROUP
+from rosrm.extensions.sinks import SinkOffer
 
 # The group of the entry points is also the name of the pluggy project.
 hookspec = pluggy.HookspecMarker(GROUP)
@@ -60,3 +61,8 @@ def register_checkpoint_policies() -> Sequence[CheckpointOffer]:  # type: ignore
 @hookspec
 def register_launchers() -> Sequence[LauncherOffer]:  # type: ignore[empty-body]
     """Offer launchers, which replace the command line of an instance (slaves)."""
+
+
+@hookspec
+def register_event_sinks() -> Sequence[SinkOffer]:  # type: ignore[empty-body]
+    """Offer event sinks, which pass events and alerts on (loaded by `rosrm alerts`)."""

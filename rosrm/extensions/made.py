@@ -28,6 +28,7 @@ _METHODS: Final[Mapping[PluginKind, tuple[str, ...]]] = {
     "migration": ("propose",),
     "checkpoint": ("choose",),
     "launcher": ("prepare",),
+    "sink": ("send", "close"),
 }
 
 #: Most labels from all probes of a host; a registration with more than 256 would be refused.

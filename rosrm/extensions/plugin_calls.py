@@ -39,6 +39,7 @@ TITLES: Final[Mapping[PluginKind, str]] = {
     "migration": "migration strategy",
     "checkpoint": "checkpoint policy",
     "launcher": "launcher",
+    "sink": "event sink",
 }
 
 #: Seconds without a failure after which a valid answer ends the state "failing". Otherwise a plugin

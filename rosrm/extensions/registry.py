@@ -59,6 +59,7 @@ from rosrm.extensions.made import (
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.placement import ScoringLink, SelectedFilter
 from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
+from rosrm.extensions.sinks import EventSink
 from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.rows import PluginKind, PluginRow, PluginState
@@ -75,6 +76,7 @@ _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "scoring": "rosrm-scoring",
     "migration": "rosrm-migration",
     "checkpoint": "rosrm-checkpoint",
+    "sink": "rosrm-alerts",
 }
 
 #: Time-out of `create` in seconds; it may load a large library.
@@ -198,6 +200,10 @@ class Registry:
         if name is None:
             return None
         return cast(CheckpointPolicy, self._required("checkpoint", name, options))
+
+    def sink(self, name: str, options: Mapping[str, Any] = EMPTY) -> EventSink:
+        """Create an event sink; raises `ConfigError` or `PluginError`."""
+        return cast(EventSink, self._required("sink", name, options))
 
     def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
         """Create migration strategies by name, in this order; raises as `scoring` does."""

@@ -3,6 +3,7 @@
 values.py               processes, hosts, instances, resources
 applications.py         applications: targets, planned actions, rows
 modes.py                modes: sets of applications of which one is in force
+notices.py              notices of events and alerts, as event sinks get them
 artifacts.py            files and directories that processes get on their hosts
 placeholders.py         placeholders in the texts of a process, which its host replaces
 parameters.py           ROS parameters from several sources, by patterns of nodes

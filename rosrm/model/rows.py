@@ -12,7 +12,9 @@ from rosrm.model.modes import ModeRow
 from rosrm.model.values import EMPTY, HostDescription
 
 #: Kinds of offers; "plugin": a plugin that failed before its offers were known.
-PluginKind = Literal["probe", "scoring", "filter", "migration", "checkpoint", "launcher", "plugin"]
+PluginKind = Literal[
+    "probe", "scoring", "filter", "migration", "checkpoint", "launcher", "sink", "plugin"
+]
 PluginState = Literal["selected", "available", "absent", "broken", "failing"]
 
 

@@ -17,6 +17,7 @@ itself absent (`SkipPlugin`), its contract is skipped with that reason.
 
 from rosrm.extensions.registry import Registry
 from rosrm.testing.checkpoints import CheckpointContract
+from rosrm.testing.event_sinks import EventSinkContract
 from rosrm.testing.filters import FilterContract
 from rosrm.testing.journals import JournalContract, MemoryJournal
 from rosrm.testing.launchers import LauncherContract
@@ -40,6 +41,7 @@ from rosrm.testing.scoring import (
 
 __all__ = [
     "CheckpointContract",
+    "EventSinkContract",
     "FakeClock",
     "FakeProbe",
     "FakeSessions",

@@ -97,17 +97,11 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 def test_the_readme_installs_all_that_runs() -> None:
     """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned.
 
-    The tools `rosrm-lab`, `rosrm-launch`, `rosrm-simulate` and `rosrm-web` are optional.
+    The tools below `tools/` are optional.
     """
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
-    optional = (
-        Path(),
-        Path("examples"),
-        Path("tools/lab"),
-        Path("tools/launch"),
-        Path("tools/simulate"),
-        Path("tools/web"),
-    )
+    tools = [project.parent for project in PROJECTS if project.parent.parent.name == "tools"]
+    optional = (Path(), Path("examples"), *tools)
     needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in optional]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])
 

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -14,10 +16,15 @@ from rosrm.cli import completion, connection
 from rosrm.cli.options import AsJson, Domain, Names, seconds_of
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
+from rosrm.wording import counted
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
     from rosrm.model.rows import EventRow
+
+#: Number of events that are shown, and of those that are written to a file, by default.
+_SHOWN: Final = 100
+_ALL_EVENTS: Final = 2**32 - 1
 
 
 def events(  # noqa: PLR0917 - an argument for each option
@@ -44,8 +51,23 @@ def events(  # noqa: PLR0917 - an argument for each option
         ),
     ] = "",
     newest: Annotated[
-        int, typer.Option("--newest", "-n", metavar="N", min=1, help="Show the newest N events.")
-    ] = 100,
+        int | None,
+        typer.Option(
+            "--newest",
+            "-n",
+            metavar="N",
+            min=1,
+            help="Show the newest N events; default: 100, and all with --mcap.",
+        ),
+    ] = None,
+    mcap: Annotated[
+        Path | None,
+        typer.Option(
+            "--mcap",
+            metavar="FILE",
+            help="Write the events to a new MCAP file, for Foxglove or Lichtblick.",
+        ),
+    ] = None,
     as_json: AsJson = False,
     domain: Domain = None,
 ) -> None:
@@ -55,6 +77,14 @@ def events(  # noqa: PLR0917 - an argument for each option
     """
     from rosrm.cli.output import json_forms, tables
 
+    if mcap is not None:
+        with connection.master(ctx, domain) as client:
+            rows = client.events(
+                process=process, host=host, newest=newest or _ALL_EVENTS, follow=follow
+            )
+            _write_mcap(mcap, rows)
+        return
+    newest = newest or _SHOWN
     with connection.master(ctx, domain) as client:
         snapshot = client.list(events=True, process=process, host=host, newest=newest)
         connection.print_trouble(snapshot)
@@ -81,6 +111,23 @@ def events(  # noqa: PLR0917 - an argument for each option
         after = snapshot.last_sequence
         for row in client.events(process=process, host=host, after=after, follow=True):
             show(row)
+
+
+def _write_mcap(path: Path, rows: Iterable[EventRow]) -> None:
+    """Write events to a new MCAP file, until they end or Ctrl-C."""
+    from contextlib import closing
+
+    from rosrm.extensions.registry import Registry
+    from rosrm.model.notices import notice_of
+
+    written = 0
+    with closing(Registry.discover().sink("mcap", {"file": str(path)})) as sink:
+        try:
+            for row in rows:
+                sink.send([notice_of(row)])
+                written += 1
+        finally:
+            echo(f"{counted(written, 'event')} written to {path}", err=True)
 
 
 def _check_names(client: Client, process: str, host: str) -> None:

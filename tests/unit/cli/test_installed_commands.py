@@ -149,6 +149,7 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
 @pytest.mark.parametrize(
     ("command", "distribution"),
     [
+        ("alerts", "rosrm-alerts"),
         ("lab", "rosrm-lab"),
         ("launch", "rosrm-launch"),
         ("simulate", "rosrm-simulate"),

@@ -1,0 +1,104 @@
+"""Notices wait on disk until their sink has taken them."""
+
+from contextlib import closing
+
+import pytest
+
+from rosrm import Notice
+from rosrm_alerts.delivery import Delivery
+from rosrm_alerts.outbox import Outbox, OutboxError
+from rosrm_alerts.sinks.webhook import Webhook, WebhookOptions
+from rosrm_alerts.watch import Subject
+from tests.waiting import wait_until
+from tests.webhook_kit import Receiver
+
+
+def notice(number: int) -> Notice:
+    return Notice(f"event-{number}", float(number), "failed", "p failed", "ERROR", "p", "h")
+
+
+@pytest.fixture
+def receiver():
+    with Receiver() as receiver:
+        yield receiver
+
+
+@pytest.fixture
+def outbox(tmp_path):
+    with closing(Outbox(tmp_path / "outbox.sqlite", most=5)) as outbox:
+        yield outbox
+
+
+def deliver(receiver: Receiver, outbox: Outbox) -> Delivery:
+    return Delivery("hook", Webhook(WebhookOptions(receiver.url)), outbox, 2, first_retry=0.01)
+
+
+def test_a_receiver_that_fails_gets_all_notices_later(receiver, outbox):
+    """In order, and each once."""
+    receiver.answer = 503
+    delivery = deliver(receiver, outbox)
+    for number in range(3):
+        outbox.commit([("hook", notice(number))], number, {})
+    delivery.notify()
+    wait_until(lambda: receiver.requests >= 3, "three attempts")
+
+    receiver.answer = 200
+    wait_until(lambda: not outbox.waiting("hook", 1), "an empty outbox")
+    delivery.close(10.0)
+
+    assert [one["id"] for one in receiver.notices] == ["event-0", "event-1", "event-2"]
+
+
+@pytest.mark.parametrize("status", [400, 404])
+def test_what_the_receiver_refuses_is_dropped(receiver, outbox, caplog, status):
+    """A notice that is never accepted must not hold up the next one."""
+    receiver.answer = status
+    outbox.commit([("hook", notice(1))], 1, {})
+    delivery = deliver(receiver, outbox)
+    wait_until(lambda: not outbox.waiting("hook", 1), "an empty outbox")
+    delivery.close(10.0)
+
+    assert receiver.requests == 1
+    assert f"1 notice dropped: 127.0.0.1 answers {status}" in caplog.text
+
+
+def test_a_redirect_is_a_failure(receiver, outbox, caplog):
+    """A POST that becomes a GET would lose the notice."""
+    receiver.answer = 302
+    outbox.commit([("hook", notice(1))], 1, {})
+    delivery = deliver(receiver, outbox)
+    wait_until(lambda: receiver.requests >= 2, "a second attempt")
+    delivery.close(10.0)
+
+    assert [one.notice.id for one in outbox.waiting("hook", 9)] == ["event-1"]
+
+
+def test_a_new_process_continues_where_the_last_one_was_killed(tmp_path):
+    """Notices, position and active alerts are in the file once `commit` has returned."""
+    path, active = tmp_path / "state" / "outbox.sqlite", {("hot", Subject(host="h")): 7.0}
+    first = Outbox(path)
+    first.commit([("hook", notice(1)), ("horn", notice(1))], 42, active)
+    first.close()
+
+    with closing(Outbox(path)) as again:
+        assert (again.position(), again.active()) == (42, active)
+        assert [one.notice for one in again.waiting("horn", 9)] == [notice(1)]
+
+
+def test_the_oldest_notices_are_dropped_beyond_the_bound(outbox):
+    """An unreachable receiver does not fill the disk; the other sinks lose nothing."""
+    outbox.commit([("other", notice(0))], 0, {})
+
+    dropped = outbox.commit([("hook", notice(number)) for number in range(8)], 8, {})
+
+    assert dropped == 3
+    assert [one.notice.id for one in outbox.waiting("hook", 9)] == [
+        f"event-{n}" for n in range(3, 8)
+    ]
+    assert len(outbox.waiting("other", 9)) == 1
+
+
+def test_a_second_process_is_refused(outbox, tmp_path):
+    """Two would send each notice twice."""
+    with pytest.raises(OutboxError, match="is another `rosrm alerts run` using it"):
+        Outbox(tmp_path / "outbox.sqlite")

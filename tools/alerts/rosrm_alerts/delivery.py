@@ -1,0 +1,84 @@
+"""Delivery of notices: a thread for each sink, with retries."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Final
+
+from rosrm.errors import describe_plugin_fault
+from rosrm.extensions.sinks import EventSink, NoticesRefused
+from rosrm.wording import counted, duration
+from rosrm_alerts.outbox import Outbox
+
+#: Seconds before the first retry, and the most between two retries; each wait doubles.
+FIRST_RETRY: Final = 1.0
+LONGEST_RETRY: Final = 300.0
+
+_log = logging.getLogger("rosrm.alerts")
+
+
+class Delivery:
+    """Delivers the notices of one sink, in order.
+
+    Args:
+        name: name of the sink in the file.
+        sink: is closed at the end.
+        batch: most notices in one call.
+    """
+
+    def __init__(
+        self, name: str, sink: EventSink, outbox: Outbox, batch: int = 1,
+        first_retry: float = FIRST_RETRY,
+    ) -> None:  # fmt: skip
+        self._name, self._sink, self._outbox, self._batch = name, sink, outbox, batch
+        self._first_retry = first_retry
+        self._wake, self._stop = threading.Event(), threading.Event()
+        # A daemon, because a sink that hangs must not keep the process alive.
+        self._thread = threading.Thread(target=self._run, name=f"sink {name}", daemon=True)
+        self._thread.start()
+
+    def notify(self) -> None:
+        """Deliver new notices now."""
+        self._wake.set()
+
+    def close(self, timeout: float) -> None:
+        """Deliver what waits, for at most `timeout` seconds, and close the sink."""
+        self._stop.set()
+        self._wake.set()
+        self._thread.join(timeout)
+        if self._thread.is_alive():
+            _log.warning("sink %s: a delivery has not ended after %g s", self._name, timeout)
+
+    def _run(self) -> None:
+        retry = 0.0
+        while True:
+            delivered = self._deliver()
+            if self._stop.is_set():
+                break
+            if delivered:
+                retry = 0.0
+                self._wake.wait()
+                self._wake.clear()
+            else:
+                retry = min(max(retry * 2.0, self._first_retry), LONGEST_RETRY)
+                _log.warning("sink %s: next attempt in %s", self._name, duration(retry))
+                self._stop.wait(retry)
+        try:
+            self._sink.close()
+        except Exception as fault:  # noqa: BLE001 - code of a plugin
+            _log.warning("sink %s: close failed: %s", self._name, describe_plugin_fault(fault))
+
+    def _deliver(self) -> bool:
+        """Deliver all that waits; return False if an attempt failed."""
+        while waiting := self._outbox.waiting(self._name, self._batch):
+            try:
+                self._sink.send([one.notice for one in waiting])
+            except NoticesRefused as refusal:
+                many = counted(len(waiting), "notice")
+                _log.error("sink %s: %s dropped: %s", self._name, many, refusal)
+            except Exception as fault:  # noqa: BLE001 - code of a plugin
+                _log.warning("sink %s: %s", self._name, describe_plugin_fault(fault))
+                return False
+            self._outbox.delivered(waiting)
+        return True

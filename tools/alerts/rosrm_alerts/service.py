@@ -1,0 +1,174 @@
+"""`rosrm alerts run`: alerts on a running cluster, and delivery of their notices."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from typing import Final
+
+from rosrm import Client, EventRow, EventSink, HostRow, Listing, NoMaster, Notice, ProcessRow
+from rosrm.model.notices import notice_of
+from rosrm_alerts.alerts_file import AlertsFile
+from rosrm_alerts.conditions import (
+    Above,
+    Happens,
+    HostLost,
+    InState,
+    SeenEvent,
+    SeenHost,
+    SeenProcess,
+    SeenResource,
+    Situation,
+)
+from rosrm_alerts.delivery import Delivery
+from rosrm_alerts.file_forms import Forwarded
+from rosrm_alerts.outbox import Outbox
+from rosrm_alerts.watch import Change, Watch
+
+#: Seconds between two looks at the cluster.
+PERIOD: Final = 1.0
+#: Seconds for the last deliveries at the end.
+CLOSING: Final = 5.0
+#: Most events in one listing; a longer absence leaves out the oldest.
+_MOST_EVENTS: Final = 10_000
+
+_log = logging.getLogger("rosrm.alerts")
+
+
+class AlertService:
+    """Looks at the cluster once a second until it is stopped.
+
+    Args:
+        file: checked contents of alerts.yaml.
+        sinks: sink and batch size by the name in the file; the service closes them.
+        outbox: where notices wait; the caller closes it.
+        connect: returns a new client of the master; raises `NoMaster`.
+    """
+
+    def __init__(
+        self, file: AlertsFile, sinks: Mapping[str, tuple[EventSink, int]], outbox: Outbox,
+        connect: Callable[[], Client],
+    ) -> None:  # fmt: skip
+        self._file, self._outbox, self._connect = file, outbox, connect
+        self._watch = Watch(file.alerts, outbox.active())
+        self._position = outbox.position()
+        self._client: Client | None = None
+        self._answers = True
+        self._deliveries = {
+            name: Delivery(name, sink, outbox, batch) for name, (sink, batch) in sinks.items()
+        }
+
+    def run(self, stop: threading.Event) -> None:
+        """Watch until `stop` is set, then deliver what waits, for some seconds."""
+        with ExitStack() as closing:
+            for delivery in self._deliveries.values():
+                closing.callback(delivery.close, CLOSING)
+            closing.callback(self._disconnect)
+            while not stop.is_set():
+                self._look()
+                stop.wait(PERIOD)
+
+    def _look(self) -> None:
+        listing = self._ask()
+        events: Sequence[EventRow] = ()
+        if listing is not None:
+            events = self._new(listing)
+            self._position = listing.last_sequence
+        situation = None if listing is None else situation_of(listing)
+        changes = self._watch.observe(time.time(), situation, map(_seen, events))
+        for change in changes:
+            _log.info("alert %s %s: %s", change.alert.name, change.kind, change.message)
+        notices = [
+            *_forwarded(self._file.forwarded, events),
+            *((sink, notice_of_change(one)) for one in changes for sink in one.alert.to),
+        ]
+        if notices or changes or events:
+            dropped = self._outbox.commit(notices, self._position, self._watch.active)
+            if dropped:
+                _log.error("%d notices were dropped: too many wait for a sink", dropped)
+        for sink in {sink for sink, _ in notices}:
+            self._deliveries[sink].notify()
+
+    def _ask(self) -> Listing | None:
+        """Return the listing of the cluster; None: the master does not answer."""
+        conditions = [alert.condition for alert in self._file.alerts]
+        try:
+            self._client = self._client or self._connect()
+            listing = self._client.list(
+                hosts=any(isinstance(one, (Above, HostLost)) for one in conditions),
+                processes=any(isinstance(one, (InState, Happens)) for one in conditions),
+                events=True, after=self._position or 0, newest=_MOST_EVENTS,
+            )  # fmt: skip
+        except NoMaster as error:
+            if self._answers:
+                _log.warning("%s", error)
+            self._answers = False
+            return None
+        if not self._answers:
+            _log.info("the master answers again")
+        self._answers = True
+        return listing
+
+    def _new(self, listing: Listing) -> Sequence[EventRow]:
+        """Return the events that have not been seen; none in the first look of all.
+
+        A sequence below the position belongs to a new journal, whose events are all new.
+        """
+        if self._position is None:
+            return ()
+        if listing.last_sequence < self._position and self._client is not None:
+            return self._client.list(events=True, newest=_MOST_EVENTS).events
+        return listing.events
+
+    def _disconnect(self) -> None:
+        if self._client is not None:
+            self._client.close()
+
+
+def situation_of(listing: Listing) -> Situation:
+    """Return the hosts and processes of a listing, as conditions see them."""
+    return Situation(
+        {row.description.name: _host(row) for row in listing.hosts},
+        {row.name: _process(row) for row in listing.processes},
+    )
+
+
+def _host(row: HostRow) -> SeenHost:
+    fresh = {one.name: SeenResource(one.usage, one.limit) for one in row.resources if not one.stale}
+    return SeenHost(row.state, fresh)
+
+
+def _process(row: ProcessRow) -> SeenProcess:
+    return SeenProcess(row.state, row.application, row.reason)
+
+
+def _seen(event: EventRow) -> SeenEvent:
+    return SeenEvent(event.kind, event.process, event.host, event.message)
+
+
+def _forwarded(
+    rules: Iterable[Forwarded], events: Sequence[EventRow]
+) -> Iterator[tuple[str, Notice]]:
+    """Yield each event for each sink that gets it, once."""
+    for event in events:
+        fitting = [rule for rule in rules if not rule.kinds or event.kind in rule.kinds]
+        for sink in dict.fromkeys(sink for rule in fitting for sink in rule.to):
+            yield sink, notice_of(event)
+
+
+def notice_of_change(change: Change) -> Notice:
+    """Return the notice of an alert that begins or ends."""
+    alert, of = change.alert, change.subject
+    return Notice(
+        id=f"alert-{alert.name}-{of}-{change.kind}-{change.time:.6f}",
+        wall_time=change.time,
+        kind=f"alert_{change.kind}",
+        message=change.message,
+        level=alert.level if change.kind == "begins" else "INFO",
+        process=of.process,
+        host=of.host,
+        alert=alert.name,
+    )

@@ -1,0 +1,1 @@
+"""Event sinks that are shipped with rosrm."""
