@@ -128,13 +128,16 @@ def noted(notes: Path) -> list[tuple[int, str, float]]:
 
 
 def test_a_node_moves_with_a_short_gap(cluster, tmp_path) -> None:
-    """The steps are: configure there, deactivate here, activate there; also in a second move."""
+    """The steps are: configure there, deactivate here, activate there; also by a drain."""
     notes = tmp_path / "notes"
     parameters = {"notes": str(notes)}
     cluster.submit(managed("walker", parameters=parameters, migration=MOVES, restart=AGAIN))
     before = cluster.wait("walker", "running")
-    for moves in (1, 2):
-        cluster.client.migrate("walker")
+    for moves, cause in ((1, "order"), (2, "drain")):
+        if cause == "order":
+            cluster.client.migrate("walker")
+        else:
+            cluster.client.set_host_state(before.host, "drain")
         after = cluster.wait("walker", "running", migrations=moves)
         assert after.host != before.host
         wait_gone(before.pid)
@@ -142,7 +145,8 @@ def test_a_node_moves_with_a_short_gap(cluster, tmp_path) -> None:
         assert (first[:2], second[:2]) == ((after.pid, "configure"), (before.pid, "deactivate"))
         assert third[:2] == (after.pid, "activate")
         assert third[2] - second[2] < SHORT
-        before = after
+        drained, before = before.host, after
+    cluster.client.set_host_state(drained, "uncordon")
     cluster.cancel("walker")
 
 
