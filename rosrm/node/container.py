@@ -12,6 +12,7 @@ constructor passes its keyword arguments on to rclpy's `Node`:
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -24,6 +25,11 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.logging import LoggingSeverity
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.utilities import remove_ros_args
+
+from rosrm.node.component_links import ComponentLinks
+from rosrm.node.identity import made_for
+from rosrm.ros.fast_dds import announcing
 
 try:
     from composition_interfaces.srv import ListNodes, LoadNode, UnloadNode
@@ -44,9 +50,10 @@ class Container:
 
     Args:
         executor: runs the callbacks of all nodes.
+        name: by which components that are processes find it on its host; "": they do not.
     """
 
-    def __init__(self, executor: SingleThreadedExecutor) -> None:
+    def __init__(self, executor: SingleThreadedExecutor, name: str = "") -> None:
         self.node = Node("container")
         self._executor = executor
         self._components: dict[int, Node] = {}
@@ -55,9 +62,13 @@ class Container:
         self.node.create_service(LoadNode, f"{_SERVICES}/load_node", self._load)
         self.node.create_service(UnloadNode, f"{_SERVICES}/unload_node", self._unload)
         self.node.create_service(ListNodes, f"{_SERVICES}/list_nodes", self._list)
+        log = self.node.get_logger()
+        self._links = ComponentLinks(name, executor, new_node, log) if name else None
 
     def close(self) -> None:
         """Destroy all nodes."""
+        if self._links is not None:
+            self._links.close()
         for node in (*self._components.values(), self.node):
             node.destroy_node()
 
@@ -85,13 +96,10 @@ class Container:
             ValueError: there is no such component, or a component of its name is loaded already.
             TypeError: it is no node of rclpy.
         """
-        component = find_component(request.package_name, request.plugin_name)
         overrides = [Parameter.from_parameter_msg(one) for one in request.parameters]
-        node = component(
-            cli_args=_arguments(request), use_global_arguments=False, parameter_overrides=overrides
-        )
-        if not isinstance(node, Node):
-            raise TypeError(f"it makes a {type(node).__name__}, not a node of rclpy")
+        plugin, words = request.plugin_name, _arguments(request)
+        with made_for({}):  # it is no process of rosrm, although the container is one
+            node = new_node(plugin, words, request.package_name, parameter_overrides=overrides)
         name = node.get_fully_qualified_name()
         if name in map(Node.get_fully_qualified_name, self._components.values()):
             node.destroy_node()
@@ -118,6 +126,23 @@ class Container:
         names = map(Node.get_fully_qualified_name, self._components.values())
         response.full_node_names = list(names)
         return response
+
+
+def new_node(plugin: str, arguments: Sequence[str], package: str = "", **options: Any) -> Node:
+    """Return the node of a component; raises what its constructor raises.
+
+    Args:
+        arguments: command line of the node; that of the container does not apply.
+
+    Raises:
+        ValueError: there is no such component.
+        TypeError: it is no node of rclpy.
+    """
+    component = find_component(package, plugin)
+    node = component(cli_args=list(arguments), use_global_arguments=False, **options)
+    if not isinstance(node, Node):
+        raise TypeError(f"it makes a {type(node).__name__}, not a node of rclpy")
+    return node
 
 
 def find_component(package: str, plugin: str) -> Callable[..., Any]:
@@ -160,15 +185,23 @@ def _arguments(request: Any) -> list[str]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a container until a signal ends it."""
-    rclpy.init(args=sys.argv if arguments is None else ["container", *arguments])
+    words = sys.argv if arguments is None else ["container", *arguments]
+    rclpy.init(args=words)
     executor = SingleThreadedExecutor()
-    container = Container(executor)
+    with announcing(os.environ, "steady", udp=False):  # as for a migratable node
+        container = Container(executor, _own_name(remove_ros_args(words)[1:]))
     try:
         with suppress(KeyboardInterrupt, ExternalShutdownException):  # the usual ends of a node
             executor.spin()
     finally:
         container.close()
         rclpy.try_shutdown()
+
+
+def _own_name(words: Sequence[str]) -> str:
+    """Return the name of this container on its host; "": rosrm has not started it."""
+    process = os.environ.get("ROSRM_PROCESS", "")
+    return words[0] if process and words else process
 
 
 if __name__ == "__main__":

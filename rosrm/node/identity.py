@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from math import inf
 from pathlib import Path
@@ -59,6 +62,26 @@ class NodeIdentity:
                 return int(file.read(_EPOCH_DIGITS))
         except (OSError, ValueError):
             return None
+
+
+#: Environment of the process whose node is being made; None: this process.
+_ENVIRONMENT: Final = ContextVar[Mapping[str, str] | None]("environment", default=None)
+
+
+@contextmanager
+def made_for(environment: Mapping[str, str]) -> Iterator[None]:
+    """Let nodes that are made now belong to the process with this environment; {}: to none."""
+    token = _ENVIRONMENT.set(environment)
+    try:
+        yield
+    finally:
+        _ENVIRONMENT.reset(token)
+
+
+def own_identity() -> NodeIdentity | None:
+    """Return the identity of a node that is being made; raises `ValueError` as `identity_from`."""
+    environment = _ENVIRONMENT.get()
+    return identity_from(os.environ if environment is None else environment)
 
 
 def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:

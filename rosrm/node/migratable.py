@@ -6,12 +6,13 @@ import contextlib
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
+from weakref import WeakValueDictionary
 
 import rclpy.node
 
 from rosrm.node.entities import ServiceOf
 from rosrm.node.handoff.session import HandoffSession
-from rosrm.node.identity import NodeIdentity, identity_from
+from rosrm.node.identity import NodeIdentity, own_identity
 from rosrm.ros.fast_dds import announcing
 
 if TYPE_CHECKING:
@@ -20,8 +21,8 @@ else:
     _Base = object
 
 
-#: The migratable node of this process, by the number of its instance.
-_NODES: Final[dict[int, Any]] = {}
+#: The migratable node of each process whose nodes run here, by the number of its instance.
+_NODES: Final = WeakValueDictionary[int, Any]()
 
 
 class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
@@ -41,7 +42,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
     _rosrm: HandoffSession | None = None
 
     def __init__(self, *arguments: Any, **named: Any) -> None:
-        identity = identity_from(os.environ)
+        identity = own_identity()
         if identity is not None:
             self._be_the_only_one(identity)
             self._rosrm = HandoffSession(self, super(), identity)

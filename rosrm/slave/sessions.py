@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from rosrm.component.link import container_of
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.supervisor.procfs import inner_pid
@@ -86,11 +87,15 @@ class SessionTable:
         return self._members.get(leader, ())
 
     def known_as(self, leader: int) -> tuple[int, ...]:
-        """Return `members` and, below a launcher's program, also their pids as they see them.
+        """Return `members` with further pids that Fast DDS writes into the names of endpoints.
 
-        Fast DDS writes these pids into the names of endpoints.
+        Below a launcher's program these are their pids as they see them; of a component's process
+        that of its container.
         """
         members = self.members(leader)
+        container = container_of(leader, self._proc)
+        if container is not None:
+            return (*members, container)
         if leader not in self._led or not self._launchers.leads(leader):
             return members
         own = []

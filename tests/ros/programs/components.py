@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import gc
+import time
 from typing import Any
 
 from rclpy.node import Node
 from std_msgs.msg import String
+
+from tests.ros.nodes import Counter
 
 
 class Talker(Node):
@@ -48,3 +51,25 @@ class Plain:
     """A class that is no node."""
 
     def __init__(self, **options: Any) -> None: ...
+
+
+class Shy(Counter):
+    """A counter that cannot be made as the destination of a move."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        if self._rosrm.identity.shadow:
+            raise OSError("no device there")
+
+
+class Stuck(Node):
+    """A node with a callback that never ends."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("stuck", **options)
+        self.create_timer(0.1, self.sleep)
+
+    def sleep(self) -> None:
+        self.get_logger().info("is stuck")
+        while True:
+            time.sleep(1.0)

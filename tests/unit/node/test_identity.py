@@ -6,7 +6,7 @@ import base64
 
 import pytest
 
-from rosrm.node.identity import NodeIdentity, identity_from
+from rosrm.node.identity import NodeIdentity, identity_from, made_for, own_identity
 
 FULL = {
     "ROSRM_INSTANCE": "robot/p#12",
@@ -72,3 +72,16 @@ def test_without_a_file_the_epoch_of_the_slave_is_not_known(tmp_path):
 def test_the_topics_of_rosrm_are_beside_the_masters():
     assert identity_from(FULL).namespace == "/rosrm"
     assert identity_from({**FULL, "ROSRM_STATE_CONFIG": "/a/b/state_config"}).namespace == "/a/b"
+
+
+def test_a_node_in_a_container_has_the_identity_of_its_component(monkeypatch):
+    """A component that is no process has none, although its container is a process of rosrm."""
+    monkeypatch.setenv("ROSRM_INSTANCE", "box#1")
+    monkeypatch.setenv("ROSRM_STATE_CONFIG", "/rosrm/state_config")
+    with made_for(FULL):
+        assert own_identity() == identity_from(FULL)
+    with made_for({}):
+        assert own_identity() is None
+    own = own_identity()
+    assert own is not None
+    assert own.process == "box"

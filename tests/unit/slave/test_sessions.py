@@ -155,6 +155,17 @@ def test_what_was_handed_out_does_not_change(tree, table):
     assert before == (10,)
 
 
+def test_the_node_of_a_component_has_the_pid_of_its_container(tree, table):
+    """The process of the component shows that pid in its name; other names mean nothing."""
+    for pid, name in ((10, "node in 77"), (20, "node in a box")):
+        tree.put(pid, pid)
+        (tree.path / str(pid) / "comm").write_text(f"{name}\n")
+        table.add(pid)
+    assert table.known_as(10) == (10, 77)
+    assert table.known_as(20) == (20,)
+    assert table.members(10) == (10,), "its usage is not that of the container"
+
+
 def test_without_descriptors_the_last_usage_stays(tree, table):
     """Usage of 0, and all seconds of a process in the next look, would be wrong readings."""
     tree.put(10, 10, own=5.0, pages=100)

@@ -1,0 +1,142 @@
+"""Links of a container to components that are processes of their own (decision 0068).
+
+A thread for each link waits for the end of the process; the executor makes and destroys the nodes.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import select
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from rclpy.node import Node
+
+from rosrm.component import link
+from rosrm.node.identity import made_for
+
+#: Makes a node by the name of its component and its command line; raises what the component raises.
+Make = Callable[[str, Sequence[str]], Node]
+#: Seconds between two tries for the address of a container that ends.
+_RETRY: Final = 0.2
+#: Seconds after the end of a process in which its node must be destroyed: another instance may be
+#: active elsewhere, because the process was fenced.
+_PATIENCE: Final = 2.0
+_LOOK: Final = 0.02
+
+
+class ComponentLinks:
+    """Components of a container that are processes.
+
+    Args:
+        name: of the container on its host.
+        executor: executes the callbacks of the nodes, and their making and end.
+        make: makes a node.
+        log: of the container.
+    """
+
+    def __init__(self, name: str, executor: Any, make: Make, log: Any) -> None:
+        self._name = name
+        self._executor = executor
+        self._make = make
+        self._log = log
+        self.nodes: list[Node] = []
+        threading.Thread(target=self._listen, name="links", daemon=True).start()
+
+    def close(self) -> None:
+        """Destroy all nodes; their processes end with this one."""
+        for node in self.nodes:
+            node.destroy_node()
+
+    def _listen(self) -> None:
+        """Accept links; the address is taken as long as a container of the name ends."""
+        where = link.address(self._name, os.environ)
+        with socket.socket(socket.AF_UNIX) as listening:
+            while not _is_bound(listening, where):
+                self._log.warning(
+                    f"another container {self._name!r} runs on this host; components that are "
+                    "processes are loaded when it has ended", once=True,
+                )  # fmt: skip
+                time.sleep(_RETRY)
+            listening.listen()
+            while True:
+                connection, _ = listening.accept()
+                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+
+    def _serve(self, connection: socket.socket) -> None:
+        """Make the node of a process, and destroy it when the process asks for that or ends."""
+        with connection:
+            request = link.receive(connection) if link.is_own(connection) else None
+            if request is None:
+                return
+            made: list[Node] = []
+            fault = self._run(lambda: made.append(self._made(request)))
+            try:
+                link.send(connection, {"pid": os.getpid(), "fault": fault})
+                connection.recv(1)
+            except OSError:
+                pass  # the process was killed
+            if made:
+                self._end(connection, made[0])
+
+    def _made(self, request: dict[str, Any]) -> Node:
+        with made_for(request["environment"]):
+            node = self._make(str(request["plugin"]), list(request["arguments"]))
+        self.nodes.append(node)
+        self._executor.add_node(node)
+        return node
+
+    def _end(self, connection: socket.socket, node: Node) -> None:
+        """Destroy a node; end this container if a callback outlasts the process for too long."""
+        ended = self._executor.create_task(self._destroy, node)
+        killed_at = None
+        while not ended.done():
+            time.sleep(_LOOK)
+            if killed_at is None and _is_gone(connection):
+                killed_at = time.monotonic()
+            if killed_at is not None and time.monotonic() - killed_at > _PATIENCE:
+                os.kill(os.getpid(), signal.SIGKILL)
+
+    def _destroy(self, node: Node) -> None:
+        self.nodes.remove(node)
+        self._executor.remove_node(node)
+        node.destroy_node()
+
+    def _run(self, work: Callable[[], None]) -> str:
+        """Have the executor do some work; return what it raised, "": nothing."""
+        done = threading.Event()
+        faults: list[str] = []
+
+        def call() -> None:
+            try:
+                work()
+            except Exception as error:  # noqa: BLE001 - whatever the component raises is its answer
+                faults.append(f"{type(error).__name__}: {error}")
+            if faults:
+                self._log.error(f"cannot load a component: {faults[0]}")
+                gc.collect()  # a node whose constructor raised is in the graph until it is freed
+            done.set()
+
+        self._executor.create_task(call)
+        done.wait()
+        return "".join(faults)
+
+
+def _is_bound(listening: socket.socket, where: str) -> bool:
+    try:
+        listening.bind(where)
+    except OSError:
+        return False
+    return True
+
+
+def _is_gone(connection: socket.socket) -> bool:
+    """Return True if the process has closed both halves, so it has ended."""
+    look = select.poll()
+    look.register(connection, 0)  # of a closed connection the kernel reports POLLHUP anyway
+    return bool(look.poll(0))
