@@ -6,11 +6,17 @@ import json
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from rosrm_lab import DATA, GIB, MIB, HostPlan, Lab, uniform
+from rosrm_launch.beside import completed
+from rosrm_launch.model import LaunchModel
+from rosrm_launch.translate import translated
+from tests.launch_files import make_package, stored
+from tests.ros.clusters import NODE
 from tests.waiting import wait_until
 
 ROSRM = str(Path(sys.executable).parent / "rosrm")
@@ -36,7 +42,7 @@ class Cluster:
         return part
 
     def ask(self, *words: str) -> str:
-        return self.lab.exec("desk", [ROSRM, *words]).stdout
+        return self.lab.exec("desk", [ROSRM, *words], timeout=PATIENCE).stdout
 
     def hosts(self) -> dict[str, dict]:
         done = self.lab.exec("desk", [ROSRM, "hosts", "--json"], check=False)
@@ -177,6 +183,31 @@ def test_a_slave_beside_the_quota_of_its_jobs(cluster):
 
 def _command(pid: int) -> str:
     return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+
+
+@pytest.mark.timeout(300)
+def test_a_launch_file_runs_on_two_hosts(cluster, tmp_path):
+    """The model that a real `launch` printed; nodes of one name run on hosts of their own."""
+    prefix, settings = tmp_path / "install", tmp_path / "talkers.rosrm.yaml"
+    make_package(prefix, NODE)
+    for host in ("host1", "host2"):
+        cluster.start(host, "slave", env={"AMENT_PREFIX_PATH": str(prefix)})
+    cluster.wait_for_hosts(host1=["up"], host2=["up"])
+    settings.write_text("nodes: {/left/driver: {apart: right.driver}}\n")
+    translation = translated(LaunchModel.model_validate(stored("talkers.launch.py")))
+    work = completed(translation, Path("talkers.launch.py"), settings)
+    (tmp_path / "talkers.json").write_text(json.dumps(work.plain()))
+    cluster.ask("apply", str(tmp_path / "talkers.json"))
+    rows = cluster.processes()
+    assert {row["state"] for row in rows.values()} == {"running"}
+    assert {rows["left.driver"]["host"], rows["right.driver"]["host"]} == {"host1", "host2"}
+    for side in ("left", "right"):
+        said = cluster.wait(
+            f"{side}.driver prints its name", partial(cluster.ask, "logs", f"{side}.driver"),
+            lambda log: '"topic"' in log,
+        )  # fmt: skip
+        assert f'"name": "/{side}/driver"' in said
+    assert f"{prefix}/share/demo_robot/maps/hall.yaml" in cluster.ask("logs", "left.driver")
 
 
 @pytest.mark.timeout(300)
