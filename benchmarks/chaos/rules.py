@@ -98,7 +98,7 @@ def judge_service(
             text = f"{name}: {one} ended, and nothing was done to it; then came {following}"
             judged.violations.append(Violation("touched", name, text))
         if guarantees.stateful:
-            judged.add(_judge_state(name, guarantees, one, following, relevant))
+            judged.add(_judge_state(name, guarantees, chained[: index + 2], relevant))
     return judged
 
 
@@ -141,9 +141,10 @@ def _judge_overlap(
 
 
 def _judge_state(
-    name: str, guarantees: Guarantees, one: Run, following: Run, disturbances: Sequence[Disturbance]
+    name: str, guarantees: Guarantees, chained: Sequence[Run], disturbances: Sequence[Disturbance]
 ) -> Judgement:
-    """Judge the continuity of the numbers; a deviation gets the title of its allowance."""
+    """Judge the continuity of the last two runs; a deviation gets the title of its allowance."""
+    *earlier, one, following = chained
     behind = one.last_number + 1 - following.first_number
     if behind == 0:
         return Judgement()
@@ -156,6 +157,13 @@ def _judge_state(
             return Judgement(allowed=Counter(state_from_nothing=1))
         if behind <= unkept(one, following, disturbances):
             return Judgement(allowed=Counter(state_older_disk_full=1))
+    # The state of `one` is out of reach, and an earlier instance had run on beside it.
+    if (
+        any(run.first_number <= following.first_number <= run.last_number + 1 for run in earlier)
+        and is_struck(name, guarantees, one, disturbances)
+        and may_be_lost(guarantees, one, following, disturbances)
+    ):
+        return Judgement(allowed=Counter(state_of_an_earlier_instance=1))
     text = f"{name}: {following.first_number} after {one.last_number}: {one}, then {following}"
     return Judgement([Violation("state", name, text)])
 

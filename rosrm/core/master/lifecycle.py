@@ -358,6 +358,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
         return
     status = end.status
     process.owner = 0
+    process.ran_on = host.name if status.run_time > 0.0 else ""
     process.exit_code = None if end.gone else status.known_exit
     if process.wanted is DesiredState.CANCEL and not (process.overdue and end.completed):
         phase, reason = cancelled_as(process)

@@ -549,10 +549,12 @@ class MasterState:
         snapshot_hosts: tuple[str, ...] = ()
         snapshots_from = 0
         if self.declared.has_snapshots(spec):
-            first_instance = self.processes[spec.name].born
-            snapshots_from = max(1, first_instance)  # 0: no snapshots
+            process = self.processes[spec.name]
+            snapshots_from = max(1, process.born)  # 0: no snapshots
             if not shadow and not restored:
-                snapshot_hosts = self.replication.in_reach(spec.name, first_instance, self.hosts)
+                snapshot_hosts = self.replication.in_reach(
+                    spec.name, process.born, self.hosts, process.ran_on
+                )
         return Assignment(
             instance, spec, self.epoch, node_name or spec.node, shadow, fence, snapshot_hosts,
             snapshots_from, restored, devices=known.devices if known else (), inactive=inactive,

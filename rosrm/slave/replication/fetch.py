@@ -11,8 +11,10 @@ from rosrm.model.values import Assignment
 from rosrm.ros.slave.replication import NotSent, NotStored, ReplicationEndpoint
 from rosrm.snapshots.format import Head, TransferPart
 
-#: Seconds for the discovery of a slave, or its answer; then the next host is asked.
-PATIENCE: Final = 3.0
+#: Seconds for the discovery of a slave, or its answer; then the next host is asked. On a busy
+#: machine discovery takes more than 3 s. The next host may have only the snapshot of an earlier
+#: instance, which ran on in a partition, and from which the process must not continue.
+PATIENCE: Final = 10.0
 #: Seconds after which a process starts from the newest local snapshot, even if a fetch is running.
 LONGEST: Final = 60.0
 

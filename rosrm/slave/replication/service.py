@@ -374,7 +374,8 @@ class ReplicationService:
             _log.info("the replica here is not used for %s: %s", instance, found.fault)
         if instance not in self._preparing:
             return
-        is_here = hosts[:1] == (self._host,) and not found.fault
+        # The master also names a host to which the replica was still on its way.
+        is_here = hosts[:1] == (self._host,) and found.head is not None and not found.fault
         if assignment.shadow or not hosts or is_here:
             del self._preparing[instance]
             done(assignment)

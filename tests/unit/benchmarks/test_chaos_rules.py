@@ -216,6 +216,21 @@ def test_a_state_that_came_to_no_other_host_in_time_is_lost():
     assert kinds(copied, [young_and_far, fresh], [OFF]) == ([], {"state_from_nothing": 1})
 
 
+def test_the_state_of_an_earlier_instance_follows_only_if_the_newer_one_is_out_of_reach():
+    """In a partition the earlier instance ran on, so its state is ahead of its successor's."""
+    copied = Guarantees(stateful=True, kept=True, copied=30, elsewhere=True)
+    apart = Disturbance("host_cut", 10.0, 26.0, frozenset({"host1"}), hides=True)
+    former = run(last=25.0, numbers=(1, 150))
+    newer = run("a#2", "host2", 15.0, 30.0, (51, 140))
+    lost = Disturbance("host_off", 30.0, 40.0, frozenset({"host2"}), kills=True, hides=True)
+    replica = Disturbance("host_off", 30.0, 40.0, frozenset({"host3"}), kills=True, hides=True)
+    back = run("a#3", "host1", 35.0, 50.0, (151, 200))
+    violations, allowed = kinds(copied, [former, newer, back], [apart, lost, replica])
+    assert (violations, allowed["state_of_an_earlier_instance"]) == ([], 1)
+    killed, same = replace(KILLED, begun=30.0, ended=30.0), replace(back, host="host2")
+    assert kinds(copied, [former, newer, same], [apart, killed])[0] == ["state"]
+
+
 def test_a_standby_bears_one_fault_and_the_copy_another():
     """With `isolation: stop`, a silent master costs both the primary and its standby."""
     guarded = Guarantees(stateful=True, standby=True, elsewhere=True, kept=True, copied=5)

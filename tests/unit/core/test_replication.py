@@ -490,3 +490,42 @@ def test_a_start_also_names_a_host_whose_replica_is_not_reported_yet():
     cluster.wait(2.0)
     cluster.cut(host, seconds=4.0)
     assert assigned(cluster).snapshot_hosts == (keeper, stale)
+
+
+def test_an_older_branch_in_reach_does_not_replace_the_newer_one_of_an_absent_host():
+    """A former instance ran on in a partition, so its snapshot covers more cycles.
+
+    The process waits for the replica of its last instance for one lease, as it would without any.
+    """
+    cluster = running(Asked(), "a", "b", "c", "d")
+    former, (keeper, *_) = where(cluster), others(cluster)
+    number = cluster["p"].owner
+    keep(cluster, keeper, ("p", number, 4))
+    cluster.cut(former, seconds=6.0)
+    (last,) = set(cluster.where("p")) - {former}
+    replica = next(name for name in cluster.machines if name not in (former, last))
+    for name in (last, replica):
+        keep(cluster, name, ("p", cluster["p"].owner, 6))
+    cluster.reconnect(former, seconds=1.0)
+    keep(cluster, former, ("p", number, 9))
+    cluster.cut(last, replica, seconds=4.5)
+    assert cluster.queue() == ["p"]
+    assert "has not rejoined yet" in cluster["p"].reason
+    cluster.reconnect(replica, seconds=1.0)
+    assert assigned(cluster).snapshot_hosts == (replica, former)
+
+
+def test_a_start_asks_the_host_of_the_last_run_first_for_an_unreported_snapshot():
+    """An instance may end before its slave has reported its first snapshot."""
+    cluster = running(Asked())
+    former, (last, stale) = where(cluster), others(cluster)
+    keep(cluster, stale, ("p", cluster["p"].owner, 9))
+    for name in (former, stale):
+        cluster.machines[name].takes = False
+    cluster.cut(former, seconds=6.0)
+    assert last in cluster.where("p")
+    cluster.machines[stale].takes, cluster.machines[last].takes = True, False
+    cluster.machines[last].finish("p", cluster.now, code=1)
+    cluster.wait(2.0)
+    cluster.restart("p")
+    assert assigned(cluster).snapshot_hosts == (last, stale)

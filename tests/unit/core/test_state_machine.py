@@ -205,6 +205,8 @@ class Play(RuleBasedStateMachine):
         self.records_seen = 0
         #: Snapshots that each host has reported to this run of the master, by name.
         self.reported: dict[str, tuple[SnapshotReport, ...]] = {}
+        #: Hosts of the newest instance of each name, and of its shadows.
+        self.ran_on: dict[str, set[str]] = {}
         #: For the present submission of each name: its first instance, and its newest snapshot.
         self.newest: dict[str, tuple[int, tuple[int, int]]] = {}
         self.prompt = True
@@ -251,19 +253,43 @@ class Play(RuleBasedStateMachine):
             assert self.cluster.now >= state.processes[name].since + order.delay
 
     def look_at_states(self, given: list[Assign]) -> None:
-        """Check that no process starts from nothing if a connected host reported its snapshot."""
+        """Check that a process starts from the newest snapshot that is in reach or may return."""
         for assign in given:
             one = assign.assignment
-            keepers = {
-                machine.name
-                for machine in self.cluster.machines.values()
-                if self.known(machine) and self.is_in_reach(machine)
-                for snapshot in self.reported.get(machine.name, ())
+            if not one.has_snapshots:
+                continue
+            instances = {
+                name: snapshot.instance.number
+                for name, snapshots in self.reported.items()
+                for snapshot in snapshots
                 if snapshot.instance.process == one.instance.process
                 and snapshot.instance.number >= one.snapshots_from
             }
-            if one.has_snapshots:
-                assert keepers <= set(one.snapshot_hosts), "assigned without a known snapshot"
+            keepers = {name for name in instances if self.known(self.machine(name))}
+            keepers = {name for name in keepers if self.is_in_reach(self.machine(name))}
+            assert keepers <= set(one.snapshot_hosts), "assigned without a known snapshot"
+            ran_on = self.ran_on.get(one.instance.process, set())
+            if not one.shadow and set(one.snapshot_hosts) <= keepers:
+                newest = max((instances[name] for name in keepers), default=0)
+                awaited = [name for name in instances.keys() - ran_on if self.may_return(name)]
+                assert all(instances[name] <= newest for name in awaited), "not waited for"
+        for assign in given:
+            self.note_host(assign)
+
+    def note_host(self, assign: Assign) -> None:
+        """Note the host of the newest instance of a process, and those of its shadows."""
+        name = assign.assignment.instance.process
+        if not assign.assignment.shadow:
+            self.ran_on.pop(name, None)
+        host = self.cluster.state.hosts.hosts[assign.host_id - 1]
+        self.ran_on.setdefault(name, set()).add(host.name)
+
+    def may_return(self, name: str) -> bool:
+        """Return True if a host was lost less than a lease ago."""
+        state = self.cluster.state
+        host = state.hosts.by_name[name]
+        lost = state.hosts.condition_of(host) is HostCondition.LOST
+        return lost and self.cluster.now < host.lost_since + state.settings.lease
 
     def look_at_order(self, given: list[Assign]) -> None:
         """Check that no process was passed by an equal one (without backfill: by any)."""
@@ -820,6 +846,25 @@ class Play(RuleBasedStateMachine):
             machine.connected = True
             for _ in range(4):
                 self.time_passes(0.5, quiet=False)
+
+    @precondition(lambda self: self.nodes())
+    @rule(which=which_one)
+    def hosts_of_a_successor_are_lost(self, which: int) -> None:
+        """Cut off a host until its process has a successor elsewhere; then all other hosts."""
+        former, node = self.pick(self.nodes(), which)
+        self.host_is_lost_with_a_state(which, comes_back=False, stubborn=False)
+        for machine, name in self.programs():
+            if name == node.instance.process and machine is not former:
+                machine.seen_in_graph(name, self.cluster.now)
+        for _ in range(2):
+            self.time_passes(1.0, quiet=False)  # its replica gets a host
+        for machine, other in self.nodes():
+            if other.instance.process == node.instance.process and machine is not former:
+                self.publish_snapshot(machine, other, told=True)
+        for machine in self.cluster.machines.values():
+            machine.connected = machine is former
+        for _ in range(4):
+            self.time_passes(2.5, quiet=False)
 
     @rule(host=hosts)
     def snapshots_are_reported(self, host: str) -> None:

@@ -459,9 +459,33 @@ def test_snapshots_and_replicas_are_private_to_their_owner(net):
 def test_a_start_that_needs_no_snapshot_of_another_host_fetches_none(net, needs_none):
     """The newest snapshot is here, or none exists, or the instance follows a source."""
     net.add_all("ab")
+    net.write("a", 41)
     net.write("b", 42)
     prepare(net, "a", needs_none)
-    assert net.age("a") is None
+    assert net.age("a") == (7, 41)
+
+
+def test_the_next_host_is_asked_if_the_replica_has_not_arrived_here(net):
+    """The master names this host first, because the replica was on its way."""
+    net.add_all("ab")
+    net.write("b", 42)
+    prepare(net, "a", assignment("a", "b"))
+    assert net.age("a") == (7, 42)
+
+
+def test_a_slave_that_is_found_late_still_provides_the_newest_snapshot(net):
+    """Here is only the snapshot of an earlier instance, which ran on and has more cycles."""
+    slave, started = net.add("a"), []
+    net.add("b")
+    net.write("a", 1006)
+    net.write("b", 990, number=8)
+    net.hidden.add("b")
+    slave.prepare(assignment("b", "a"), started.append)
+    net.pass_times(8, 1.0)
+    assert not started
+    net.hidden.clear()
+    net.until(lambda: started, "the start")
+    assert net.age("a") == (8, 990)
 
 
 def test_a_stateless_process_starts_at_once(net):

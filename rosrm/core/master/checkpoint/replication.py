@@ -73,17 +73,28 @@ def awaits_states(state: MasterState, process: Process, now: float) -> bool:
     """Return True if an absent host has or may have a replica, and may rejoin soon.
 
     A process that starts now might begin without its snapshot. So it waits for hosts that have not
-    rejoined since the master started, until they are lost. If no replica is in reach, it also waits
-    one lease for a lost host other than its own.
+    rejoined since the master started, until they are lost. It also waits one lease for a lost host
+    other than its own, if only snapshots of earlier instances are in reach, or none: an earlier
+    instance that ran on in a partition has another state than its successor.
     """
     if not state.declared.has_snapshots(process.spec):
         return False
     if (state.hosts.condition == HostCondition.EXPECTED).any():
         return True
-    return not state.replication.in_reach(process.name, process.born, state.hosts) and any(
-        _may_rejoin(state, state.hosts.by_name[name], now)
-        for name in state.replication.replicas.hosts_of(process.name, process.born)
-        if name in state.hosts.by_name and not _was_left_on(process, name)
+    known, name = state.replication, process.name
+    reached = max(
+        (
+            known.newest_instance(name, host)
+            for host in known.in_reach(name, process.born, state.hosts)
+        ),
+        default=0,
+    )
+    return any(
+        replica.number > max(reached, process.born - 1)
+        and host in state.hosts.by_name
+        and not _was_left_on(process, host)
+        and _may_rejoin(state, state.hosts.by_name[host], now)
+        for host, replica in known.replicas.of(name).items()
     )
 
 

@@ -234,6 +234,8 @@ class Process:
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
             process runs.
         ended_on: name of the host of its last run; "": it has not ended, or never ran.
+        ran_on: name of the host on which its last instance ran until it ended; "": unknown. The
+            slave there may not have reported the newest snapshot yet. Not persisted.
         decision: newest placement decision about it, with its kind.
         left_behind: instance that may still run on a lost host, while this process waits in the
             queue.
@@ -274,6 +276,7 @@ class Process:
     moved_at: float = -inf
     exit_code: int | None = None
     ended_on: str = ""
+    ran_on: str = ""
     wall: float = 0.0
     phase_before_loss: tuple[ProcessPhase, float, float] | None = None
     restarts: int = 0

@@ -127,19 +127,35 @@ class ReplicationState:
     waiting: list[str] = field(default_factory=list)
     reviewed_at: float = -inf
 
-    def in_reach(self, process: str, since: int, hosts: HostTable) -> tuple[str, ...]:
+    def in_reach(
+        self, process: str, since: int, hosts: HostTable, ran_on: str = ""
+    ) -> tuple[str, ...]:
         """Return the hosts in reach with a snapshot of an instance numbered `since` or higher.
 
-        The newest snapshot is first, after the hosts that should get a replica and have not
-        reported one yet: it may have arrived since their report, and would be the newest.
+        The newest reported snapshot comes after two that may be newer, and not reported yet: that
+        of the host on which the last instance ran, and those of the hosts that should get a
+        replica.
+
+        Args:
+            ran_on: name of the host on which the last instance ran; "": unknown.
         """
         known = self.replicas.hosts_of(process, since)
-        last_order = self.last_orders.get(process)
-        chosen: tuple[str, ...] = ()
-        if last_order is not None and last_order.number >= since:
-            chosen = last_order.choice.hosts
+        unreported = (name for name in self._chosen(process, since) if name not in known)
         return tuple(
             name
-            for name in (*(name for name in chosen if name not in known), *known)
+            for name in dict.fromkeys((ran_on, *unreported, *known))
             if name in hosts.by_name and hosts.condition_of(hosts.by_name[name]) in _IN_REACH
         )
+
+    def _chosen(self, process: str, since: int) -> tuple[str, ...]:
+        """Return the hosts that should get a replica."""
+        last = self.last_orders.get(process)
+        return last.choice.hosts if last is not None and last.number >= since else ()
+
+    def newest_instance(self, process: str, host: str) -> int:
+        """Return the number of the newest instance whose snapshot a host may have; 0: of none."""
+        known = self.replicas.of(process).get(host)
+        if known is not None:
+            return known.number
+        last = self.last_orders.get(process)
+        return last.number if last is not None and host in last.choice.hosts else 0
