@@ -23,7 +23,7 @@ LIST_PERIOD: Final = 0.5
 def loads_of(assignment: Assignment) -> LoadedComponents | None:
     """Return the components that the slave loads into an instance; None: none."""
     spec = assignment.spec
-    if not spec.components or assignment.restored:
+    if not spec.components:
         return None
     node = qualified_name(spec.namespace, assignment.node_name or spec.node)
     return LoadedComponents(f"{node}/_container", spec.components)

@@ -11,7 +11,7 @@ from rosrm.core.slave import commands, components, events, fencing, lifecycle_no
 from rosrm.core.slave.health import InstanceHealth, watch_of
 from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.core.slave.steps import Step
-from rosrm.core.slave.watches import Awaited, Memo
+from rosrm.core.slave.watches import FIRST_RUN, Awaited, Memo
 from rosrm.model.devices import title_of
 from rosrm.model.values import (
     Assignment,
@@ -92,17 +92,19 @@ def _refused(
 
 def _waiting(assignment: Assignment) -> HeldInstance:
     spec = assignment.spec
+    lifecycle, loads = lifecycle_nodes.managed(assignment), components.loads_of(assignment)
     awaited = None
-    if spec.awaits_graph and not assignment.restored:  # a restored node rejoins the graph later
+    if spec.awaits_graph and (not assignment.restored or lifecycle or loads):
         name = assignment.node_name
         name = qualified_name(spec.namespace, name) if name else ""
-        awaited = Awaited(name, spec.readiness.timeout)
+        # A restored node rejoins the graph later. A later run does not begin from that image.
+        seen = FIRST_RUN if assignment.restored else 0
+        awaited = Awaited(name, spec.readiness.timeout, seen)
     status = InstanceStatus(assignment.instance, InstanceState.HELD)
     watch, fenced = watch_of(assignment), assignment.fence is not None
     return HeldInstance(
         status, spec, awaited, watch=watch, fenced=fenced, devices=assignment.devices,
-        artifacts=spec.artifacts, lifecycle=lifecycle_nodes.managed(assignment),
-        loads=components.loads_of(assignment),
+        artifacts=spec.artifacts, lifecycle=lifecycle, loads=loads,
     )  # fmt: skip
 
 
@@ -331,9 +333,13 @@ def _follow(
 def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:
     """Return the status of a new run: ready at once, or after its node appears in the graph."""
     held.steering = held.loading = None
-    if held.awaited is None or held.awaited.seen == reported.pid:
+    awaited = held.awaited
+    if awaited is not None and awaited.seen == FIRST_RUN:
+        first = reported.pid if reported.restarts == 0 else 0
+        held.awaited = awaited = replace(awaited, seen=first)
+    if awaited is None or awaited.seen == reported.pid:
         return replace(reported, state=InstanceState.READY)
-    held.ready_by = now + held.awaited.timeout
+    held.ready_by = now + awaited.timeout
     return reported
 
 

@@ -40,13 +40,10 @@ _SCHEME: Final = "rosservice://"
 
 
 def managed(assignment: Assignment) -> ManagedLifecycle | None:
-    """Return the goal of an instance's node; None: the slave does not change its state.
-
-    A restored node is in the state in which it was frozen.
-    """
+    """Return the goal of an instance's node; None: the slave does not change its state."""
     spec = assignment.spec
     policy, node = spec.lifecycle, assignment.node_name or spec.node
-    if not policy.is_managed or assignment.restored:
+    if not policy.is_managed:
         return None
     get_state, change_state = (
         resolve(f"~/{service}", spec.namespace, node, spec.remappings, _SCHEME)

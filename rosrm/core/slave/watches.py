@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
-from typing import Literal
+from typing import Final, Literal
 
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
@@ -12,6 +12,10 @@ from rosrm.model.values import Component, Health, LifecycleGoal
 
 #: Lifecycle transitions that a slave requests.
 Transition = Literal["configure", "activate", "deactivate"]
+
+
+#: `Awaited.seen` of an instance whose first run is restored, and as ready as it was when frozen.
+FIRST_RUN: Final = -1
 
 
 class NoState(Enum):
@@ -28,7 +32,7 @@ class Awaited:
     Attributes:
         node_name: fully qualified name of its node; "": a node of any name.
         timeout: seconds in which the node of each run must appear.
-        seen: pid of the run whose node has appeared; 0: none.
+        seen: pid of the run whose node has appeared; 0: none; `FIRST_RUN`: that of the first run.
     """
 
     node_name: str

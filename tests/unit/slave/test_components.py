@@ -137,6 +137,16 @@ def test_the_next_run_gets_all_components_again() -> None:
         assert stale == [], "the answer of the former run"
 
 
+def test_a_restored_container_is_loaded_from_its_second_run_on() -> None:
+    """Its image has all components; a later run starts without any."""
+    slave = Slave()
+    slave.assign(SPEC, restored=True)
+    assert states(slave.status(InstanceState.RUNNING, "c")) == [InstanceState.READY]
+    slave.status(InstanceState.BACKOFF, "c")
+    slave.status(InstanceState.RUNNING, "c", pid=6)
+    assert slave.step(SeenInGraph(C)) == [ListComponents(C, 6, "/robot/c/_container")]
+
+
 def test_a_component_gets_the_devices_and_artifacts_of_its_container() -> None:
     """They stand in its parameters and extra arguments; other texts and numbers stay."""
     model, root = Artifact("model", "0" * 64, 5), Path("/cache")

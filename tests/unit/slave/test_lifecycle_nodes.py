@@ -215,6 +215,29 @@ def test_each_run_is_activated_again() -> None:
     assert request.pid == 6
 
 
+def test_a_restored_node_is_managed_from_its_second_run_on() -> None:
+    """The first run is in the state in which it was frozen; a later one starts unconfigured."""
+    slave = Slave()
+    slave.assign(spec(), restored=True)
+    stored = slave.of("n").memo
+    assert states(slave.status(InstanceState.RUNNING, "n")) == [InstanceState.READY]
+    assert re_adopted(stored).of("n").status.state is InstanceState.READY
+    slave.status(InstanceState.BACKOFF, "n")
+    assert states(slave.status(InstanceState.RUNNING, "n", pid=6)) == [InstanceState.RUNNING]
+    (request,) = slave.step(SeenInGraph(N))
+    assert isinstance(request, ReadLifecycleState)
+
+
+def test_a_slave_does_not_take_a_second_run_for_the_restored_one() -> None:
+    """The process was restarted while no slave ran; the number of restarts shows it."""
+    slave = Slave()
+    slave.assign(spec(), restored=True)
+    later = re_adopted(slave.of("n").memo, restarts=1)
+    assert later.of("n").status.state is InstanceState.RUNNING
+    (request,) = later.step(SeenInGraph(N))
+    assert isinstance(request, ReadLifecycleState)
+
+
 def test_the_next_slave_goes_on_where_the_node_is() -> None:
     """The memo has the goal; a node that was ready stays ready."""
     slave = seen()
@@ -228,12 +251,12 @@ def test_the_next_slave_goes_on_where_the_node_is() -> None:
     assert transitions(read(later, "inactive")) == ["activate"]
 
 
-def re_adopted(memo: Memo) -> Slave:
+def re_adopted(memo: Memo, restarts: int = 0) -> Slave:
     """Return a later run of the slave that re-adopts the node from the supervisor."""
     later = Slave()
     stored = from_memo(to_memo(memo))
     assert stored is not None
-    status = InstanceStatus(N, InstanceState.RUNNING, PID)
+    status = InstanceStatus(N, InstanceState.RUNNING, PID, restarts=restarts)
     later.step(SupervisorReplaced((status,), {N: stored}))
     return later
 
