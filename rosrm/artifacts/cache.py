@@ -145,6 +145,8 @@ class ArtifactCache:
         directory = incoming.path.with_suffix("")
         try:
             incoming.check()
+            if target.is_dir():
+                return  # a cancelled fetch of it had all parts, and completed after this one began
             unpack(incoming.path, directory)
             target.parent.mkdir(mode=0o700, exist_ok=True)
             directory.rename(target)

@@ -66,6 +66,19 @@ def test_a_process_sees_its_artifacts_under_their_names(cache, offered):
     assert cache.assemble((one, two)) == directory
 
 
+def test_an_artifact_that_arrives_twice_is_stored_once(cache, offered, root):
+    """A cancelled fetch may complete all the same, while the next one of the artifact runs."""
+    one, content = offered("model")
+    cancelled = cache.begin(one, [])
+    cancelled.write(content)
+    incoming = cache.begin(one, [])
+    cache.finish(cancelled)
+    incoming.write(content)
+    cache.finish(incoming)
+    assert cache.missing((one,), []) == []
+    assert not list((root / "incoming").iterdir())
+
+
 def test_a_directory_is_an_artifact_like_a_file(cache, tmp_path):
     """Its files and links are below its name."""
     source = tmp_path / "scripts"
