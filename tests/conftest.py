@@ -18,6 +18,7 @@ from hypothesis import settings
 from rosrm.runtime import cgroups
 from rosrm.supervisor.group_trees import PREFIX
 from rosrm.supervisor.instance_groups import remove_empty
+from tests.cpp.core_library import cpp_core  # noqa: F401 - fixture of several layers
 from tests.criu_kit import criu, theatre  # noqa: F401 - fixtures of several layers
 
 HERE = Path(__file__).parent

@@ -6,9 +6,12 @@ from contextlib import closing
 
 import pytest
 
+from rosrm.node import Node
 from rosrm.testing.loopback import enter_private_network
+from tests.cpp.core_library import VARIABLE
+from tests.cpp.cpp_node import Node as CppNode
 from tests.ros.clusters import STEADY, clusters
-from tests.ros.nodes import KEYS, Stage
+from tests.ros.nodes import KEYS, Counting, Serving, Stage
 from tests.ros.portable_kit import Listener
 
 
@@ -48,3 +51,28 @@ def stage(request):
     stage = Stage(keys=getattr(request, "param", KEYS))
     yield stage
     stage.close()
+
+
+@pytest.fixture
+def cpp_node_class(cpp_core, monkeypatch):
+    """Return the base class of nodes of rosrm_node_cpp."""
+    monkeypatch.setenv(VARIABLE, str(cpp_core))
+    return CppNode
+
+
+@pytest.fixture(params=["rosrm.node", "rosrm_node_cpp"])
+def implementation(request):
+    """Return the base class of migratable nodes of each implementation of the handoff protocol."""
+    return Node if request.param == "rosrm.node" else request.getfixturevalue("cpp_node_class")
+
+
+@pytest.fixture
+def counter(implementation):
+    """Return the class of a counter."""
+    return type("Counter", (Counting, implementation), {})
+
+
+@pytest.fixture
+def server(implementation):
+    """Return the class of a counter with a service."""
+    return type("Server", (Serving, implementation), {})

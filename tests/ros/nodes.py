@@ -45,8 +45,8 @@ EPOCH = 3
 RELIABLE = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 
-class Counter(Node):
-    """A node that counts by a timer, and sums up received numbers."""
+class Counting:
+    """Base of a node that counts by a timer, and sums up received numbers."""
 
     def __init__(self, name: str = "counter", period: float = 0.02, **named: Any) -> None:
         super().__init__(name, **named)
@@ -77,7 +77,7 @@ class Counter(Node):
         self.total = message.data
 
 
-class Server(Counter):
+class Serving(Counting):
     """A counter that answers requests with its name, and counts them."""
 
     def __init__(self, group: Any = None, **named: Any) -> None:
@@ -89,6 +89,27 @@ class Server(Counter):
         self.served += 1
         response.message = self.get_name()
         return response
+
+
+class Counter(Counting, Node):
+    """`Counting` as a node of `rosrm.node`."""
+
+
+class Server(Serving, Node):
+    """`Serving` as a node of `rosrm.node`."""
+
+
+def hold(node: Any) -> None:
+    """Keep a shadow from its activation."""
+    if isinstance(node, Node):
+        node._rosrm._destination._activate = lambda: None
+    else:
+        node.hold()
+
+
+def buffered(node: Any) -> int:
+    """Return the number of messages that a node has buffered."""
+    return len(node._rosrm.entities.buffer) if isinstance(node, Node) else node.buffered
 
 
 class Stage:
@@ -297,7 +318,7 @@ class Conductor:
 
     def silence(self, destination: Any) -> None:
         """Silence the source, while its destination, a node, stays a shadow."""
-        destination._rosrm._destination._activate = lambda: None
+        hold(destination)
         self.prepare()
         self.say(StateConfig.SWITCH)
         self.wait(self.config.source, HandoffReport.RELEASED)

@@ -10,16 +10,17 @@ from std_msgs.msg import Int64
 
 from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
 from rosrm_msgs.msg import StateConfig
+from tests.cpp.core_library import ROOT, VARIABLE
 from tests.ros.clusters import CALM, NODE, alive, host
 from tests.ros.nodes import Conductor, Stage
 from tests.waiting import PATIENCE, wait_until
 
-#: A counter with a fault: `{fault}` is the end of its constructor.
+#: A counter with a fault: `{fault}` is the end of its constructor, `{node}` imports its base class.
 COUNTER = """
 import os, sys, rclpy
 from rclpy.executors import ExternalShutdownException
 from std_msgs.msg import Int64
-from rosrm.node import Node
+{node}
 
 class Counter(Node):
     def __init__(self):
@@ -60,8 +61,27 @@ def spec(name: str, code: str, **options) -> ProcessSpec:
     )  # fmt: skip
 
 
-def counter(name: str, fault: str = "self.keep()", **options) -> ProcessSpec:
-    return spec(name, COUNTER.replace("{fault}", fault), **options)
+PYTHON = "from rosrm.node import Node"
+
+
+def code(fault: str, node: str = PYTHON) -> str:
+    return COUNTER.replace("{fault}", fault).replace("{node}", node)
+
+
+def counter(name: str, fault: str = "self.keep()", node: str = PYTHON, **options) -> ProcessSpec:
+    return spec(name, code(fault, node), **options)
+
+
+@pytest.fixture(params=["rosrm.node", "rosrm_node_cpp"])
+def node(request) -> str:
+    """Return the line that imports each implementation of the handoff protocol."""
+    if request.param == "rosrm.node":
+        return PYTHON
+    core = request.getfixturevalue("cpp_core")
+    return (
+        f"os.environ[{VARIABLE!r}] = {str(core)!r}; sys.path.insert(0, {str(ROOT)!r})\n"
+        "from tests.cpp.cpp_node import Node"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -85,13 +105,13 @@ def end_of_migration(cluster, name: str):
     return ends[0]
 
 
-def test_a_node_whose_clock_stands_still_moves(cluster) -> None:
+def test_a_node_whose_clock_stands_still_moves(cluster, node) -> None:
     """A node on simulated time without a clock migrates, because rosrm uses another clock."""
     ticks = (
         "from rclpy.clock import Clock, ClockType; clock = Clock(clock_type=ClockType.STEADY_TIME)"
         "; self.create_timer(0.02, self.tick, clock=clock); self.keep()"
     )
-    still = counter("still", ticks)
+    still = counter("still", ticks, node)
     cluster.submit(replace(still, parameters={"use_sim_time": True}))
     _, event = migrate(cluster, "still")
     assert event.kind == "migrated", event.message
@@ -108,9 +128,9 @@ def test_a_node_whose_clock_stands_still_moves(cluster) -> None:
         ("dying", "self.keep(); self.shadow and sys.exit(3)", "ended on h"),
     ],
 )  # fmt: skip
-def test_a_move_that_fails_leaves_the_source_running(cluster, name, fault, message) -> None:
+def test_a_move_that_fails_leaves_the_source_running(cluster, name, fault, message, node) -> None:
     """The event has one clear message, and nothing else is left."""
-    cluster.submit(counter(name, fault))
+    cluster.submit(counter(name, fault, node))
     before, event = migrate(cluster, name)
     assert event.kind == "stayed"
     assert message in event.message
@@ -124,7 +144,7 @@ def test_a_destination_that_is_never_ready_is_given_up_in_time(cluster):
 
     Two fail at once: of a node of plain rclpy, and of one whose shadow hangs.
     """
-    hangs = COUNTER.replace("{fault}", "self.shadow and __import__('time').sleep(60)")
+    hangs = code("self.shadow and __import__('time').sleep(60)")
     programs = {"plain": NODE, "hangs": hangs}
     cluster.submit(*(spec(name, code, ready_timeout=2.0) for name, code in programs.items()))
     before = {name: cluster.wait(name, "running") for name in programs}

@@ -2,86 +2,104 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.node.handoff.buffer import InputBuffer, Sent
+from tests.cpp.core_parts import CppInputBuffer
 
 A, B = "/a", "/b"
 ROOM = 1000
+
+
+#: Creates a buffer from its limit, room and time.
+Make = Callable[[int, int, float], Any]
+
+
+@pytest.fixture(scope="module", params=["Python", "C++"])
+def make(request) -> Make:
+    """Return each implementation of the buffer: of `rosrm.node`, and of `rosrm_node_cpp`."""
+    if request.param == "Python":
+        return InputBuffer
+    return partial(CppInputBuffer, request.getfixturevalue("cpp_core"))
 
 
 def drained(buffer):
     return [(kept.topic, kept.stamp) for kept in iter(buffer.take, None)]
 
 
-def filled(*messages, limit=100):
-    buffer = InputBuffer(limit, ROOM, 0.0)
+def filled(make, *messages, limit=100):
+    buffer = make(limit, ROOM, 0.0)
     for topic, stamp in messages:
         assert buffer.add(topic, Sent(stamp), None, 0.0)
     return buffer
 
 
-def test_messages_come_out_in_the_order_in_which_they_came_in():
+def test_messages_come_out_in_the_order_in_which_they_came_in(make):
     """The order holds across inputs, too."""
     messages = [(A, 3), (B, 9), (A, 4), (B, 10)]
-    assert drained(filled(*messages)) == messages
+    assert drained(filled(make, *messages)) == messages
 
 
-def test_what_a_state_covers_is_dropped():
+def test_what_a_state_covers_is_dropped(make):
     """The rest stays, in order."""
-    buffer = filled((A, 1), (B, 1), (A, 2), (A, 3))
+    buffer = filled(make, (A, 1), (B, 1), (A, 2), (A, 3))
     buffer.cover(A, [1, 2], single=True, now=0.0)
     assert drained(buffer) == [(B, 1), (A, 3)]
 
 
-def test_a_message_may_come_after_the_state_that_covers_it():
+def test_a_message_may_come_after_the_state_that_covers_it(make):
     """Marks and inputs arrive on different topics."""
-    buffer = filled()
+    buffer = filled(make)
     buffer.cover(A, [5], single=False, now=0.0)
     assert buffer.add(A, Sent(5), None, 0.0)
     assert buffer.add(A, Sent(6), None, 0.0)
     assert drained(buffer) == [(A, 6)]
 
 
-def test_older_messages_of_a_covered_publisher_are_skipped():
+def test_older_messages_of_a_covered_publisher_are_skipped(make):
     """The source never had it, and a late process would break the order."""
-    buffer = filled((A, 1), (A, 2), (A, 3))
+    buffer = filled(make, (A, 1), (A, 2), (A, 3))
     buffer.cover(A, [2], single=True, now=0.0)
     assert drained(buffer) == [(A, 3)]
 
 
-def test_the_clocks_of_several_publishers_are_not_compared():
+def test_the_clocks_of_several_publishers_are_not_compared(make):
     """A robot's clock that is behind does not make its messages covered."""
-    buffer = filled((A, 1000), (A, 3))
+    buffer = filled(make, (A, 1000), (A, 3))
     buffer.cover(A, [1000], single=False, now=0.0)
     assert drained(buffer) == [(A, 3)]
 
 
-def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered():
+def test_a_publisher_that_moves_to_a_clock_behind_is_not_taken_for_covered(make):
     """Both the publisher's time stamps and those processed by the source show the change."""
-    buffer = filled((A, 1000))
+    buffer = filled(make, (A, 1000))
     buffer.cover(A, [1000], single=True, now=0.0)
     assert buffer.add(A, Sent(3), None, 0.0)
     assert drained(buffer) == [(A, 3)]
-    buffer = filled()
+    buffer = filled(make)
     buffer.cover(A, [1000, 3], single=True, now=0.0)
     assert buffer.add(A, Sent(4), None, 0.0)
     assert drained(buffer) == [(A, 4)]
 
 
-def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left():
+def test_a_publisher_that_is_alone_again_is_not_measured_by_one_that_left(make):
     """The clock of the publisher that left may have been ahead."""
-    buffer = filled()
+    buffer = filled(make)
     buffer.cover(A, [10, 1000], single=False, now=0.0)
     buffer.cover(A, [11], single=True, now=0.0)
     assert buffer.add(A, Sent(12), None, 0.0)
     assert drained(buffer) == [(A, 12)]
 
 
-def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
+def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it(make):
     """The sequence numbers of its publisher show the gap."""
-    buffer = InputBuffer(10, ROOM, 0.0)
+    buffer = make(10, ROOM, 0.0)
     for stamp, number in ((10, 1), (20, 2), (40, 4)):
         assert not buffer.misses_one(A)
         buffer.add(A, Sent(stamp, number), None, 0.0)
@@ -93,9 +111,9 @@ def test_a_message_that_did_not_come_is_missed_until_a_state_covers_it():
     assert not buffer.misses_one(A)
 
 
-def test_numbers_of_several_publishers_show_no_loss():
+def test_numbers_of_several_publishers_show_no_loss(make):
     """Numbers of a restarted publisher do not show a loss either."""
-    buffer = InputBuffer(10, ROOM, 0.0)
+    buffer = make(10, ROOM, 0.0)
     buffer.cover(A, [5], single=False, now=0.0)
     for stamp, number in ((10, 1), (20, 70), (30, 2)):
         buffer.add(A, Sent(stamp, number), None, 0.0)
@@ -105,9 +123,9 @@ def test_numbers_of_several_publishers_show_no_loss():
     assert not buffer.misses_one(B)
 
 
-def test_the_buffer_is_bounded_for_each_input():
+def test_the_buffer_is_bounded_for_each_input(make):
     """A flood on one input does not push out another's messages."""
-    buffer = filled((A, 1), (A, 2), limit=2)
+    buffer = filled(make, (A, 1), (A, 2), limit=2)
     assert not buffer.add(A, Sent(3), None, 0.0)
     assert buffer.add(B, Sent(3), None, 0.0)
     buffer.cover(A, [1], single=True, now=0.0)
@@ -115,9 +133,9 @@ def test_the_buffer_is_bounded_for_each_input():
     assert drained(buffer) == [(A, 2), (B, 3), (A, 3)]
 
 
-def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
+def test_an_input_overlaps_once_a_message_was_here_and_in_the_state(make):
     """The order of the two makes no difference."""
-    buffer = filled((A, 5))
+    buffer = filled(make, (A, 5))
     buffer.cover(A, [4], single=True, now=0.0)
     assert not buffer.overlaps(A)
     buffer.cover(A, [5], single=True, now=0.0)
@@ -128,9 +146,9 @@ def test_an_input_overlaps_once_a_message_was_here_and_in_the_state():
     assert buffer.overlaps(B)
 
 
-def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
+def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while(make):
     """The time counts from the beginning of the buffer."""
-    buffer = InputBuffer(10, ROOM, 100.0)
+    buffer = make(10, ROOM, 100.0)
     assert not buffer.is_idle(A, 100.5, 0.0, 1.0)
     assert buffer.is_idle(A, 101.0, 0.0, 1.0)
     assert not buffer.is_idle(A, 101.0, 100.5, 1.0)
@@ -140,9 +158,9 @@ def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while():
     assert buffer.is_idle(A, 103.0, 0.0, 1.0)
 
 
-def test_an_input_that_the_source_is_sent_is_not_idle():
+def test_an_input_that_the_source_is_sent_is_not_idle(make):
     """A reliable reader may still wait for a message that was lost on its way."""
-    buffer = InputBuffer(10, ROOM, 100.0)
+    buffer = make(10, ROOM, 100.0)
     buffer.cover(A, [1, 2], single=True, now=102.0)
     assert not buffer.is_idle(A, 102.5, 0.0, 1.0)
     buffer.cover(A, [2, 3], single=True, now=102.6)
@@ -152,7 +170,7 @@ def test_an_input_that_the_source_is_sent_is_not_idle():
 
 
 @given(st.data())
-def test_source_and_successor_together_process_each_message_once(data):
+def test_source_and_successor_together_process_each_message_once(make, data):
     """This holds for any interleaving of messages and marks, and any stop of the source."""
     total = data.draw(st.integers(1, 12))
     joined = data.draw(st.integers(0, total))  # the shadow receives messages from here on
@@ -163,7 +181,7 @@ def test_source_and_successor_together_process_each_message_once(data):
     while messages or marks:
         first = data.draw(st.sampled_from([queue for queue in (messages, marks) if queue]))
         events.append(first.pop(0))
-    buffer = InputBuffer(100, ROOM, 0.0)
+    buffer = make(100, ROOM, 0.0)
     for kind, value in events:
         if kind == "message":
             assert buffer.add(A, Sent(value), None, 0.0)
