@@ -27,11 +27,14 @@ def main() -> NoReturn:
     os.dup2(2, 1)
     file, show_arguments = sys.argv[1], "--show-args" in sys.argv[2:]
     given = [word for word in sys.argv[2:] if ":=" in word]
+    usual = tempfile.gettempdir()
     with tempfile.TemporaryDirectory(prefix="rosrm-launch-") as scratch:
         # launch makes a folder for its log, and leaves its files of parameters behind.
         os.environ["ROS_LOG_DIR"] = os.environ["TMPDIR"] = tempfile.tempdir = scratch
         answer = _answer(file, given, show_arguments=show_arguments)
-    results.write(answer.model_dump_json(exclude_defaults=True) + "\n")
+    # Names of files that the processes will make.
+    text = answer.model_dump_json(exclude_defaults=True).replace(scratch, usual)
+    results.write(f"{text}\n")
     results.flush()
     os._exit(0)  # threads of the launch file may never end
 

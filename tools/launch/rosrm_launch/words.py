@@ -66,6 +66,7 @@ def existing_paths(process: Process) -> list[str]:
     for one in process.parameters:
         for value in one.values.values():
             texts += [str(part) for part in (value if isinstance(value, list) else [value])]
+    texts += [text.rpartition("=")[2] for text in texts]  # as in --file=PATH and file:=PATH
     return sorted(
         {text for text in texts if text.startswith("/") and not text.startswith(_SYSTEM)
          and len(text) < _LONGEST_PATH and "\n" not in text and Path(text).exists()}

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import sys
+import tempfile
 from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
@@ -114,6 +117,18 @@ def test_arguments_that_only_substitutions_ask_for_are_known(file):
     (process,) = resolve(file(body), given, timeout=30.0).processes
     assert process.command == ["x", "2"]
     assert (process.interrupt_grace, process.prefix) == (9.0, ["nice"])
+
+
+@needs_launch
+def test_a_temporary_file_of_the_launch_file_is_listed(file):
+    """No host has such a file; a mere name is one that a process will make."""
+    body = "import tempfile\nmade, name = tempfile.mkstemp('.sdf')[1], tempfile.mktemp('.txt')\n"
+    body += "return L([ExecuteProcess(cmd=['x', f'--file={made}', name])])"
+    model = resolve(file(body), [], timeout=30.0)
+    (process,), (omission,) = model.processes, model.omissions
+    assert omission.action == "temporary file of x"
+    assert re.fullmatch(r"the launch file makes \S+\.sdf on this machine only", omission.reason)
+    assert (Path(process.command[2]).parent, process.paths) == (Path(tempfile.gettempdir()), [])
 
 
 @needs_launch

@@ -160,13 +160,10 @@ def test_transitions_of_unknown_nodes_are_listed():
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        (
-            "events.launch.py",
-            ["OnProcessIO", "OnProcessExit", "OnShutdown", "LogInfo", "EmitEvent"],
-        ),
+        ("events.launch.py", ["OnProcessIO", "OnProcessExit", "OnShutdown", "EmitEvent"]),
         (
             "scopes.launch.py",
-            ["SetROSLogDir", "environment of alone", "OnProcessStart", "LogInfo", "Node"],
+            ["SetROSLogDir", "environment of alone", "OnProcessStart", "Node"],
         ),
         ("lifecycle.launch.py", ["OnStateTransition", "transition inactive_shutdown of /maps"]),
         ("components.launch.py", ["component demo::Unnamed of /camera/pipeline"]),

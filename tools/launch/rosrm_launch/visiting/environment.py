@@ -6,7 +6,7 @@ from typing import Any
 
 from launch import actions as launched
 
-from rosrm_launch.visiting.state import Visit
+from rosrm_launch.visiting.state import Visit, program_of
 
 #: Variables that the resolver has only while it runs.
 _OF_RESOLVER = ("ROS_LOG_DIR", "TMPDIR")
@@ -50,7 +50,7 @@ def variables(visit: Visit, action: Any) -> dict[str, str]:
     described = action.process_description
     final = dict(described.final_env)
     if described.env is not None and _lacking(visit, final):
-        title = f"environment of {described.final_name.rpartition('-')[0]}"
+        title = f"environment of {program_of(action)}"
         visit.omit(action, "`env` replaces all variables; its own are added instead", title)
         return final
     added = {visit.text(name) for name, _ in described.additional_env or ()}

@@ -48,7 +48,7 @@ def visit_message(visit: Visit, action: Any) -> None:
     if visit.trigger == Trigger():
         action.execute(visit.context)
     else:
-        visit.omit(action, "rosrm prints no message at an event")
+        visit.note("LogInfo: messages at events and timers are not printed")
 
 
 def visit_handler(visit: Visit, handler: Any) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,9 +11,10 @@ from typing import Any
 from launch.actions.execute_local import ExecuteLocal
 from launch_ros import actions as ros
 
+from rosrm.wording import listed
 from rosrm_launch.model import Component, Process, ProcessKind
 from rosrm_launch.visiting import environment, events, transitions
-from rosrm_launch.visiting.state import Visit, hidden
+from rosrm_launch.visiting.state import Visit, hidden, program_of
 from rosrm_launch.words import RosArguments, existing_paths
 
 
@@ -93,8 +95,8 @@ def _add(visit: Visit, action: Any, **fields: Any) -> None:
         terminate_grace=float(visit.text(action.sigkill_timeout)),
         waits=list(visit.trigger.waits), delay=visit.trigger.delay, **fields,
     )  # fmt: skip
-    process = process.model_copy(update={"paths": existing_paths(process)})
-    visit.processes.append(process)
+    paths = _without_temporary(visit, action, existing_paths(process))
+    visit.processes.append(process.model_copy(update={"paths": paths}))
     visit.numbers[id(action)] = number
     if action.emulate_tty:
         visit.note("emulate_tty: processes have no terminal; `rosrm logs` shows their output")
@@ -102,3 +104,13 @@ def _add(visit: Visit, action: Any, **fields: Any) -> None:
     if on_exit is not None:
         title = f"on_exit of {type(action).__name__}"
         events.follow(visit, action, on_exit, "exited", action, title)
+
+
+def _without_temporary(visit: Visit, action: Any, paths: Sequence[str]) -> list[str]:
+    """Return paths without those that the launch file has just made, which are listed."""
+    temporary = [path for path in paths if Path(path).is_relative_to(tempfile.gettempdir())]
+    if temporary:
+        names = listed([Path(path).name for path in temporary])
+        reason = f"the launch file makes {names} on this machine only"
+        visit.omit(action, reason, f"temporary file of {program_of(action)}")
+    return [path for path in paths if path not in temporary]

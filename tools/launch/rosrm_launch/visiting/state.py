@@ -95,6 +95,11 @@ class Visit:
         self.deferred.append(Deferred(entities, trigger, self.file, variables))
 
 
+def program_of(action: Any) -> str:
+    """Return the name of a prepared process, to which launch adds a number."""
+    return str(action.process_description.final_name.rpartition("-")[0])
+
+
 def hidden(action: Any, of: type, name: str, default: Any = None) -> Any:
     """Return an attribute that a class of launch does not publish."""
     return getattr(action, f"_{of.__name__}__{name}", default)
