@@ -83,5 +83,7 @@ def _follow(connection: socket.socket, plugin: str, arguments: list[str]) -> str
 
 
 if __name__ == "__main__":
-    _fault = main(sys.argv[1:])
-    sys.exit(f"rosrm.component: {_fault}" if _fault else 0)
+    _fault = " ".join(main(sys.argv[1:]).split())
+    if _fault:
+        sys.stderr.write(f"{link.FAULT}{_fault}\n")
+    sys.exit(link.FAILED if _fault else 0)

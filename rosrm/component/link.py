@@ -19,6 +19,12 @@ from typing import Any, Final
 _PLACE: Final = ("ROSRM_MASTER", "ROSRM_HOST", "ROS_DOMAIN_ID")
 #: Most bytes of a line; a parameter file is passed by its path.
 _LONGEST: Final = 1 << 20
+#: Beginning of the line by which a component's process says why it has failed: its last one.
+FAULT: Final = "rosrm.component: "
+#: Exit code after such a line.
+FAILED: Final = 1
+#: Most bytes of that line that are read.
+_TAIL: Final = 4096
 #: Name that the kernel shows for the process of a loaded component (at most 15 characters).
 _TITLE: Final = "node in "
 _CREDENTIALS: Final = struct.Struct("3i")
@@ -72,3 +78,15 @@ def container_of(pid: int, proc: str = "/proc") -> int | None:
         return None
     number = name.removeprefix(_TITLE)
     return int(number) if number != name and number.isdecimal() else None
+
+
+def fault_in(log: Path) -> str:
+    """Return why a component's process has failed, from the end of its log; "": not known."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
+            lines = file.read(_TAIL).decode(errors="replace").splitlines()
+    except OSError:
+        return ""
+    last = lines[-1] if lines else ""
+    return last.removeprefix(FAULT) if last.startswith(FAULT) else ""

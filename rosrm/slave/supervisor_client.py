@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.artifacts.cache import without_directories
+from rosrm.component.link import FAILED, fault_in
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
 from rosrm.core.supervisor import events as orders
@@ -26,6 +27,7 @@ from rosrm.supervisor.client import (
     SupervisorEnded,
     SupervisorGone,
     SupervisorSilent,
+    log_path,
 )
 from rosrm.supervisor.client_values import (
     Amended,
@@ -199,7 +201,7 @@ class SupervisorLink:
 
     def _take_messages(self, received: Sequence[SupervisorMessage]) -> None:
         statuses = tuple(
-            replace(one, message=without_directories(one.message))
+            replace(one, message=without_directories(self._explained(one)))
             for one in received
             if isinstance(one, InstanceStatus)
         )
@@ -210,6 +212,14 @@ class SupervisorLink:
         for one in received:
             if isinstance(one, Amended):
                 self._take(events.AmendmentRecorded(one.instance, one.amendment, one.refusal))
+
+    def _explained(self, status: InstanceStatus) -> str:
+        """Return the message of a status, with the reason that a component's process logged."""
+        code = f"exit code {FAILED}"
+        if not status.message.startswith(code):
+            return status.message
+        fault = fault_in(log_path(self.state, status.instance))
+        return status.message.replace(code, f"{code}: {fault}", 1) if fault else status.message
 
     def take_over(self) -> int:
         """Re-adopt the supervisor's instances, and return their number; no others run."""

@@ -172,10 +172,7 @@ def test_a_component_stays_if_it_cannot_be_loaded_there(cluster, stage, name, fi
     assert event.kind == "stayed", event.message
     after = cluster.wait(name, "running")
     assert (after.host, after.pid) == (before.host, before.pid)
-    (there,) = {"a", "b"} - {before.host}
-    assert f"ended on {there}: exit code 1" in event.message
-    log = cluster.client.read_log(there, name, 0, 0, 0)
-    assert said in log.content.decode()
+    assert said in event.message
     so_far = len(counts)
     stage.spin_until(lambda: len(counts) > so_far + 20, "counts after the move")
     numbers = [one.data for one in counts]
@@ -217,11 +214,10 @@ def test_components_start_again_with_their_container(cluster) -> None:
 
 
 def test_a_component_that_cannot_be_loaded_has_failed(cluster) -> None:
-    """Its log says what the constructor raised."""
+    """The process says what the constructor raised."""
     cluster.submit(component("broken", BROKEN, restart=RestartPolicy("never")))
     row = cluster.wait("broken", "failed")
-    assert row.reason == "exit code 1"
-    assert "cannot be loaded: OSError: no device here" in cluster.log("broken")
+    assert row.reason == "exit code 1: cannot be loaded: OSError: no device here"
 
 
 def test_a_stuck_container_does_not_outlive_a_process_that_was_killed(cluster) -> None:

@@ -55,3 +55,21 @@ def test_the_process_of_a_component_says_what_it_lacks():
     )  # fmt: skip
     assert run.returncode == 1
     assert "run it as a process of rosrm, with the arguments CONTAINER PLUGIN" in run.stderr
+
+
+@pytest.mark.parametrize(
+    ("log", "fault"),
+    [
+        (b"x\nrosrm.component: no container\n", "no container"),
+        (b"x" * 9999 + b"\nrosrm.component: late\n", "late"),
+        (b"rosrm.component: of an earlier run\nx\n", ""),
+        (b"\xff", ""),
+        (b"", ""),
+    ],
+)
+def test_the_last_line_of_a_log_says_why_a_component_failed(tmp_path, log, fault):
+    """Any other line is of another run, or of another program."""
+    path = tmp_path / "log"
+    assert link.fault_in(path) == ""
+    path.write_bytes(log)
+    assert link.fault_in(path) == fault
