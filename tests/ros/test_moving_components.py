@@ -13,7 +13,13 @@ from std_msgs.msg import Int64
 
 from rosrm.model.applications import Target
 from rosrm.model.rows import ProcessRow
-from rosrm.model.values import MigrationPolicy, ProcessSpec, Readiness, RestartPolicy
+from rosrm.model.values import (
+    LifecyclePolicy,
+    MigrationPolicy,
+    ProcessSpec,
+    Readiness,
+    RestartPolicy,
+)
 from tests.ros.clusters import CALM, Cluster, host
 from tests.ros.nodes import RELIABLE, Stage
 from tests.ros.test_handoffs import migrate
@@ -25,6 +31,7 @@ ROOT = Path(__file__).resolve().parents[2]
 COUNTER = "tests.ros.nodes:Counter"
 SHY = "tests.ros.programs.components:Shy"
 BROKEN = "tests.ros.programs.components:Broken"
+MANAGED = "tests.ros.programs.components:Managed"
 STUCK = "tests.ros.programs.components:Stuck"
 AGAIN = RestartPolicy("on-failure", delay=0.2)
 
@@ -178,6 +185,20 @@ def test_a_component_stays_if_it_cannot_be_loaded_there(cluster, stage, name, fi
     numbers = [one.data for one in counts]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     cluster.cancel(name)
+
+
+def test_a_lifecycle_node_moves_between_containers(cluster) -> None:
+    """The slaves of both hosts change the state of the node in the container of their host."""
+    policy = LifecyclePolicy("active", PATIENCE)
+    moves = MigrationPolicy("lifecycle_node")
+    cluster.submit(component("driver", MANAGED, lifecycle=policy, migration=moves))
+    before = cluster.wait("driver", "running")
+    cluster.client.migrate("driver")
+    after = cluster.wait("driver", "running", migrations=1)
+    assert after.host != before.host
+    for at in "ab":
+        assert "/driver/driver is activated" in cluster.log(f"box_{at}")
+    cluster.cancel("driver")
 
 
 def test_a_component_ends_with_its_process_and_starts_again(cluster, stage) -> None:

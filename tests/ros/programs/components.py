@@ -6,6 +6,7 @@ import gc
 import time
 from typing import Any
 
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from std_msgs.msg import String
 
@@ -73,3 +74,14 @@ class Stuck(Node):
         self.get_logger().info("is stuck")
         while True:
             time.sleep(1.0)
+
+
+class Managed(LifecycleNode):
+    """A lifecycle node that prints its name when it is activated."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("managed", **options)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.get_logger().info(f"{self.get_fully_qualified_name()} is activated")
+        return super().on_activate(state)
