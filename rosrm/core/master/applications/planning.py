@@ -19,6 +19,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import handoff
 from rosrm.core.master.migration.preemption import preempt
 from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.intents import Unjournaled
 from rosrm.core.master.state.process import WAITING, Process, ProcessPhase
 from rosrm.model.applications import Action, PlannedAction
 from rosrm.model.orders import FenceInstance, StartInstance, StopInstance
@@ -100,6 +101,8 @@ def copied(state: MasterState) -> MasterState:
     ]  # fmt: skip
     for process in state.processes.values():
         shared += (process.spec, process.plain, process.decision, process.demand)
+    for instance in state.instances.values():
+        shared += (instance.id, instance.estimated)
     for host in state.hosts.hosts:
         shared.append(host.description)
     for application in state.applications.values():
@@ -110,7 +113,7 @@ def copied(state: MasterState) -> MasterState:
     memo.update((id(one.history), list(one.history)) for one in state.processes.values())
     copy = deepcopy(state, memo)
     copy.settings = replace(state.settings, progress_deadline=0.0)  # a plan shows what waits
-    copy.rankings_version = -1
+    copy.rankings_version, copy.unsaved = -1, Unjournaled()
     return copy
 
 

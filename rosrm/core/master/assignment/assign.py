@@ -132,6 +132,8 @@ def joint_demand(state: MasterState, demands: Mapping[str, Demand]) -> Demand:
 def unable(state: MasterState, process: Process, source: str) -> dict[str, str]:
     """Return the hosts to which the strategy cannot move the process, each with the reason."""
     strategy = process.spec.migration.strategy or ""
+    if not capabilities.are_checked(state, strategy):
+        return {}
     here = state.hosts.by_name[source]
     faults = {
         host.name: capabilities.fault(state, strategy, here, host) for host in state.hosts.hosts

@@ -91,6 +91,12 @@ def note_answer(
         )  # fmt: skip
 
 
+def are_checked(state: MasterState, strategy: str) -> bool:
+    """Return True if a strategy checks between which hosts it can move processes."""
+    checking: object = state.strategies.get(strategy)
+    return implements(checking, HostChecking)
+
+
 def fault(state: MasterState, strategy: str, source: Host, destination: Host) -> str:
     """Return why a strategy cannot move anything from one host to another; "" if it can.
 

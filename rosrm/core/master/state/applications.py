@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Final
 
+from rosrm.core.master.state.lazy import Plain
 from rosrm.model.applications import RolloutPolicy
-from rosrm.model.codec import fields_from_plain, fields_to_plain, from_plain, to_plain
+from rosrm.model.codec import fields_from_plain, fields_to_plain, from_plain
 from rosrm.model.values import ProcessSpec
 
 
@@ -133,7 +134,7 @@ def key_of(name: str, number: int) -> str:
 
 def version_to_dict(version: Version) -> dict[str, Any]:
     """Return a version as JSON."""
-    specs = [to_plain(spec) for spec in version.specs.values()]
+    specs = [Plain(spec) for spec in version.specs.values()]
     return {**fields_to_plain(version, _VERSION), "specs": specs}
 
 

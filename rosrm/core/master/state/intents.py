@@ -55,6 +55,16 @@ class Unsaved:
         return found
 
 
+class Unjournaled(Unsaved):
+    """Parts of a copied state that plans change; they have no intents."""
+
+    def take(self, tables: Tables) -> list[Intent]:  # noqa: ARG002 - as in the other class
+        """Clear all parts."""
+        for parts in (self.processes, self.migrations, self.applications):
+            parts.clear()
+        return []
+
+
 def process_intent(tables: Tables, process: Process) -> Intent:
     """Return the desired state of a process with its instances and its standby."""
     instances = [(str(number), tables.instances[number]) for number in process.instances]
