@@ -25,6 +25,7 @@ LARGEST_SPEC: Final = 1 << 20
 
 _OTHER_LETTERS: Final = {
     "Sealed.principal": sealed_codec.MOST_LETTERS,
+    "ApplicationTarget.digest": 1 << 20,
     "KeyValue.value": 1 << 20,
     "ProcessSpec.command": 1 << 17,
     "ProcessSpec.arguments": 1 << 17,

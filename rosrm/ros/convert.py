@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from array import array
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
@@ -252,17 +252,18 @@ def _json_values(pairs: Iterable[msg.KeyValue]) -> dict[str, Any]:
 
 
 def target_to_msg(
-    target: Target, digest: str = "", *, with_specs: bool = True
+    target: Target, digests: Sequence[str] = (), sent: Iterable[int] | None = None
 ) -> msg.ApplicationTarget:
     """Return the desired state of an application as a message.
 
     Args:
-        digest: of its specs; "": unknown.
-        with_specs: False: only the digest is sent.
+        digests: of its specs; (): unknown.
+        sent: positions of the specs that are sent; None: all.
     """
+    specs = target.specs if sent is None else [target.specs[at] for at in sent]
     return msg.ApplicationTarget(
-        application=target.application, version=target.version, digest=digest,
-        processes=[spec_to_msg(spec) for spec in target.specs] if with_specs else [],
+        application=target.application, version=target.version, digest=" ".join(digests),
+        processes=[spec_to_msg(spec) for spec in specs],
         max_parallel=target.rollout.max_parallel,
         healthy_for=float(target.rollout.healthy_for), on_failure=target.rollout.on_failure,
     )  # fmt: skip

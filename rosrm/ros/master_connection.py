@@ -7,7 +7,7 @@ import math
 import os
 import time
 from array import array
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
@@ -29,7 +29,7 @@ from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.ros.introductions import introduction_of, introduction_request
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
-from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of
+from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of, positions_from_text
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import srv
 
@@ -280,23 +280,25 @@ class MasterClient:
 
     def apply(self, targets: Sequence[Target], *, plan_only: bool = False) -> ApplyResult:
         """Make applications as desired, or return the plan of that."""
-        digests = [digest_of(one.specs) if one.specs else "" for one in targets]
+        digests = [[digest_of(spec) for spec in one.specs] for one in targets]
         headings = [replace(one, specs=()) for one in targets]
 
-        def ask(*, with_specs: bool) -> ApplyResult:
+        def ask(sent: Iterable[Iterable[int] | None]) -> ApplyResult:
             messages = [
-                convert.target_to_msg(one, digest, with_specs=with_specs)
-                for one, digest in zip(targets, digests, strict=True)
+                convert.target_to_msg(*one) for one in zip(targets, digests, sent, strict=True)
             ]
             answer = self._request(srv.Apply, names.APPLY, targets=messages, plan_only=plan_only)
             return replace(_apply_result(answer), work=digest_of([headings, digests]))
 
-        try:
-            return ask(with_specs=False)
-        except Refused as refusal:
-            if refusal.code != UNKNOWN_DIGEST:
-                raise
-        return ask(with_specs=True)
+        lacking: Sequence[Iterable[int]] = [()] * len(targets)
+        for _ in range(2):
+            try:
+                return ask(lacking)
+            except Refused as refusal:
+                if refusal.code != UNKNOWN_DIGEST:
+                    raise
+                lacking = positions_from_text(str(refusal), map(len, digests))
+        return ask([None] * len(targets))  # requests of others have replaced the specs
 
     def load_modes(self, modes: Sequence[Mode]) -> str:
         """Replace the modes of the cluster, all or none; return the master's message."""

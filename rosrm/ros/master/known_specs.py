@@ -2,44 +2,48 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
-from rosrm.errors import Refused
 from rosrm.model.values import ProcessSpec
-from rosrm.ros.spec_digests import LENGTH, UNKNOWN_DIGEST
+from rosrm.ros.spec_digests import LENGTH
 
-_Specs = tuple[ProcessSpec, ...]
-
-#: Most requests whose specs are kept.
-_MOST: Final = 8
+#: Most specs that are kept: two of the largest requests.
+_MOST: Final = 20_000
 
 
 class KnownSpecs:
-    """Specs that each user has sent, by the digest that the user gave.
+    """Specs that each user has sent, by the digests that the user gave.
 
-    The digest is not checked: a wrong one affects only the later requests of the same user.
+    The digests are not checked: a wrong one affects only the later requests of the same user.
     """
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[str, str], _Specs] = {}
+        self._kept: dict[tuple[str, str], ProcessSpec] = {}
 
-    def keep(self, user: str, digest: str, specs: _Specs) -> None:
-        """Keep specs for the next requests of a user; drop the oldest ones."""
-        if not specs or len(digest) != LENGTH:
-            return
-        self._kept.pop((user, digest), None)
-        self._kept[user, digest] = specs
-        if len(self._kept) > _MOST:
+    def lacking(self, user: str, digests: Sequence[str]) -> list[int]:
+        """Return the positions of the digests of which no spec is kept."""
+        return [at for at, digest in enumerate(digests) if (user, digest) not in self._kept]
+
+    def completed(
+        self, user: str, digests: Sequence[str], sent: Sequence[ProcessSpec]
+    ) -> tuple[ProcessSpec, ...]:
+        """Return all specs of a target, in the order of their digests.
+
+        Args:
+            sent: the specs that are not kept, or all.
+        """
+        if len(sent) == len(digests):
+            return tuple(sent)
+        rest = iter(sent)
+        found = (self._kept.get((user, digest)) for digest in digests)
+        return tuple(next(rest) if one is None else one for one in found)
+
+    def keep(self, user: str, digests: Sequence[str], specs: Sequence[ProcessSpec]) -> None:
+        """Keep the specs of a target for the next requests of a user; drop the oldest ones."""
+        for digest, spec in zip(digests, specs, strict=False):
+            self._kept.pop((user, digest), None)
+            if len(digest) == LENGTH:
+                self._kept[user, digest] = spec
+        while len(self._kept) > _MOST:
             del self._kept[next(iter(self._kept))]
-
-    def find(self, user: str, digest: str) -> _Specs:
-        """Return the specs that a user has sent with a digest; raise `Refused` if none are kept."""
-        specs = self._kept.get((user, digest))
-        if specs is None:
-            raise Refused(
-                f"the master does not have the processes with the digest {digest!r:.80}; send the "
-                f"processes themselves",
-                UNKNOWN_DIGEST,
-            )
-        self.keep(user, digest, specs)
-        return specs

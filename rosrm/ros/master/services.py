@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Protocol
 
@@ -33,7 +33,7 @@ from rosrm.ros.master.known_specs import KnownSpecs
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
-from rosrm.ros.spec_digests import digest_of
+from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of, positions_to_text
 from rosrm.runtime.local_zone import local_zone
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm.wording import sanitized
@@ -194,9 +194,15 @@ class MasterServices:
 
     def _applied(self, request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:
         by = _requester(peer)
-        targets = tuple(
-            convert.target_from_msg(one, self._specs_of(one, by)) for one in request.targets
-        )
+        digests = [one.digest.split() for one in request.targets]
+        self._refuse_unknown(request.targets, digests, by.name)
+        specs = [
+            self._specs_of(one, known, by.name)
+            for one, known in zip(request.targets, digests, strict=True)
+        ]
+        for known, found in zip(digests, specs, strict=True):
+            self._known.keep(by.name, known, found)
+        targets = tuple(map(convert.target_from_msg, request.targets, specs))
         return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
 
     def _modes_loaded(
@@ -206,13 +212,19 @@ class MasterServices:
         modes = tuple(replace(mode, digest=digest_of(mode)) for mode in found)
         return happened.ModesLoaded(token, modes, _requester(peer))
 
-    def _specs_of(self, target: Any, by: Requester) -> tuple[ProcessSpec, ...]:
-        """Return the specs of a target of a request; it may name known ones by their digest."""
-        if target.digest and not target.processes:
-            return self._checked(self._known.find(by.name, target.digest))
-        specs = tuple(convert.spec_from_msg(message) for message in target.processes)
-        self._known.keep(by.name, target.digest, specs)
-        return self._checked(specs)
+    def _refuse_unknown(
+        self, targets: Sequence[Any], digests: Sequence[Sequence[str]], user: str
+    ) -> None:
+        """Refuse targets that name processes of which this master has no specs."""
+        lacking = [self._known.lacking(user, named) for named in digests]
+        for one, named, unknown in zip(targets, digests, lacking, strict=True):
+            if named and len(one.processes) not in (len(unknown), len(named)):
+                raise Refused(positions_to_text(lacking), UNKNOWN_DIGEST)
+
+    def _specs_of(self, target: Any, digests: Sequence[str], user: str) -> tuple[ProcessSpec, ...]:
+        """Return the specs of a target of a request; it may name known ones by their digests."""
+        sent = tuple(map(convert.spec_from_msg, target.processes))
+        return self._checked(self._known.completed(user, digests, sent) if digests else sent)
 
     def _targets(self, messages: Iterable[Any]) -> tuple[Target, ...]:
         return tuple(convert.target_from_msg(one, self._specs(one.processes)) for one in messages)
