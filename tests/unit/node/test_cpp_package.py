@@ -55,3 +55,9 @@ def test_the_core_needs_no_ros(tmp_path):
     assert not [
         one.name for one in sources if re.search(r'include "(rclcpp|\w+_msgs)/', one.read_text())
     ]
+
+
+def test_the_page_shows_the_example():
+    """The documentation contains the file that is compiled."""
+    page = (ROOT / "docs/how-to/stateful-node.md").read_text()
+    assert f"```cpp\n{(PACKAGE / 'examples/counter.cpp').read_text()}```" in page
