@@ -9,6 +9,7 @@ from typing import Any, Final, Union, get_args, get_origin, get_type_hints
 
 from hypothesis import strategies as st
 
+from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.arrays import NO_ARRAY
 from rosrm.model.artifacts import Artifact
 from rosrm.model.component_rules import components_fault
@@ -104,6 +105,7 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "secrets": st.dictionaries(
         PROPER_NAMES.map("secret-of-a-{}".format), PRINTABLE.map("/{}".format), max_size=3
     ),
+    "adoption": st.just(NO_ADOPTION),  # with which few other fields go
     "container": st.just(Container()) | st.builds(Container, PROPER_NAMES, PROPER_NAMES),
     "launchers": st.lists(PROPER_NAMES, max_size=3).map(tuple),
     "message": PRINTABLE,

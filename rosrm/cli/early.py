@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 #: Commands that send requests to the master.
 ASKING: Final = frozenset({
-    "submit", "apply", "revert", "mode", "run", "cancel", "restart", "migrate", "checkpoint",
-    "restore", "prune", "cordon", "uncordon", "drain", "rebalance", "reload", "status", "ps",
-    "apps", "history", "hosts", "plugins", "explain",
+    "submit", "adopt", "apply", "revert", "mode", "run", "cancel", "restart", "migrate",
+    "checkpoint", "restore", "prune", "cordon", "uncordon", "drain", "rebalance", "reload",
+    "status", "ps", "apps", "history", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip
 #: Options with which a command joins ROS with other settings or not at all.

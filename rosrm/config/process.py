@@ -20,6 +20,7 @@ from rosrm.extensions.units import (
     Quantity,
     Seconds,
 )
+from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.artifacts import artifacts_of
 from rosrm.model.durations import LONGEST
@@ -363,6 +364,7 @@ class ProcessInFile:
             application="",
             secrets={name: secret.file for name, secret in self.secrets.items()},
             container=Container() if self.container is None else _same(Container, self.container),
+            adoption=NO_ADOPTION,  # of a process that runs, so no file has one
             artifacts=artifacts_of(self.artifacts),
             given=(),
         )

@@ -23,6 +23,7 @@ arrays.py               the array of a job, and the placeholder of its index
 schedules.py            times at which a job starts again
 job_checks.py           rules for arrays and schedules
 limits.py               rules for limits and scheduling of a process
+adoption.py             a running process that becomes the first instance, adoption_rules.py
 container_rules.py      rules for the container of a process
 component_rules.py      rules for the components that a slave loads into a container
 lifecycle_rules.py      rules for processes whose slave changes their lifecycle state

@@ -12,6 +12,7 @@ from enum import Enum
 from types import MappingProxyType
 from typing import Any, Final, Literal
 
+from rosrm.model.adoption import NO_ADOPTION, Adoption
 from rosrm.model.arrays import NO_ARRAY, ArrayMembership
 from rosrm.model.artifacts import Artifact, fetch_time
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
@@ -421,6 +422,7 @@ class ProcessSpec:
         secrets: variable to the absolute path of a file on its host; each start sets the variable
             to the content of the file.
         container: container in which it runs.
+        adoption: the running process that becomes its first instance; later ones are started.
         artifacts: files and directories that it gets on its host, in the order of their names.
         given: paths of the fields that the submitter gave, such as "restart.when"; the cluster's
             default applies to the others. Empty: the fields that differ from their defaults here.
@@ -475,6 +477,7 @@ class ProcessSpec:
     together: str = ""
     secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     container: Container = Container()
+    adoption: Adoption = NO_ADOPTION
     artifacts: tuple[Artifact, ...] = ()
     given: tuple[str, ...] = field(default=(), compare=False)
 

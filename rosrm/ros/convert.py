@@ -13,6 +13,7 @@ from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
 from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.model import values
+from rosrm.model.adoption_rules import adoption_fault
 from rosrm.model.applications import OnFailure, RolloutPolicy, Target
 from rosrm.model.artifacts import Artifact, artifacts_fault, contents_fault
 from rosrm.model.component_rules import components_fault
@@ -232,6 +233,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
         container_fault,
         lifecycle_fault,
         components_fault,
+        adoption_fault,
     )
     fault = next(filter(None, (check(spec) for check in checks)), "")
     if fault:

@@ -4,7 +4,8 @@ The slave adds the leader of each session, and the control group of its instance
 the group has all processes and the exact usage. Without a group, one walk a second finds the other
 processes by their session id: `getsid` for each process of the host, which takes a microsecond and
 reads no file. A process that begins a session of its own (a daemon) then leaves the tree, as in job
-control. Where a launcher's program leads the session, the launcher knows the members.
+control. Where a launcher's program leads the session, the launcher knows the members. An adopted
+process leads no session of its own, so it has its descendants as members.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Final
 from rosrm.component.link import container_of
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.launchers import Launchers
-from rosrm.supervisor.procfs import inner_pid
+from rosrm.supervisor.procfs import descendants, inner_pid
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 #: KiB of a process that the kernel cannot reclaim. Pages of files are shared and reclaimable, and a
@@ -67,6 +68,7 @@ class SessionTable:
         self._launchers = launchers or Launchers()
         self._members: dict[int, tuple[int, ...]] = {}
         self._groups: dict[int, InstanceGroup] = {}
+        self._adopted: set[int] = set()  # leaders in a session of others
         self._led: set[int] = set()  # leaders that are, or may become, a launcher's program
         self._pids: tuple[int, ...] = ()
         self._ended_cpu_time = 0.0
@@ -109,6 +111,9 @@ class SessionTable:
         if group is not None and group.exists:
             self._groups[leader] = group
         self._members[leader] = (leader,)
+        with contextlib.suppress(OSError):  # it has ended
+            if self._session_of(leader) != leader:
+                self._adopted.add(leader)
         if self._launchers.leads(leader) is not False:
             self._led.add(leader)
         self._collect_pids()
@@ -121,6 +126,7 @@ class SessionTable:
         """
         self._members.pop(leader, None)
         self._groups.pop(leader, None)
+        self._adopted.discard(leader)
         self._led.discard(leader)
         self._usage.pop(leader, None)
         self._cpu_time.pop(leader, None)
@@ -161,6 +167,8 @@ class SessionTable:
             found[leader] += [pid for pid in group.pids() if pid != leader]
         if len(self._groups) < len(self._members):
             self._walk(found)
+        for leader in self._adopted:
+            found[leader] = [leader, *descendants(leader)]
         for leader in tuple(self._led):
             leads = self._launchers.leads(leader)
             if leads:

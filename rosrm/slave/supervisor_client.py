@@ -107,6 +107,11 @@ class SupervisorLink:
         """Return True if the supervisor reads the secrets of instances."""
         return self._client.reads_secrets
 
+    @property
+    def adopts(self) -> bool:
+        """Return True if the supervisor can adopt processes."""
+        return self._client.adopts
+
     def group_of(self, instance: InstanceId) -> InstanceGroup:
         """Return the control group of an instance."""
         return InstanceGroup(self._client.groups, instance)

@@ -7,6 +7,7 @@
     connection.py         the supervisor's side of a connection, with send_buffer.py
     spawn.py              spawning of one process
     spawn_into.py         the same into a control group of version 2
+    adoption.py           checks before a process that was started without rosrm is taken over
     secret_files.py       secrets, read just before a spawn
     confinement.py        start of an instance within its limits
     group_trees.py        where control groups may be made

@@ -80,6 +80,7 @@ class SupervisorClient:
         reads_secrets: it reads the secrets of instances; one of an earlier version does not.
         amends_limits: it can change the limits of a running instance; one of an earlier version
             cannot.
+        adopts: it can adopt processes; one of an earlier version cannot.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -100,7 +101,7 @@ class SupervisorClient:
         self.fenced: frozenset[InstanceId] = frozenset()
         self.unenforced: Mapping[str, str] = {}
         self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
-        self.reads_secrets = self.amends_limits = False
+        self.reads_secrets = self.amends_limits = self.adopts = False
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -209,6 +210,7 @@ class SupervisorClient:
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,
             fence_rule(order.fence), order.last_contact, order.limits, order.secrets,
+            order.adoption,
         )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -299,6 +301,7 @@ class SupervisorClient:
         self.unenforced = messages.read_texts(fields.get("unenforced", _NOTHING_ENFORCED))
         self.reads_secrets = bool(fields.get("secrets", False))
         self.amends_limits = bool(fields.get("amends", False))
+        self.adopts = bool(fields.get("adopts", False))
         groups: Any = fields.get("groups", ())
         self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}

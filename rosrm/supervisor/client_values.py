@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rosrm.core.supervisor.rules import (
+    AdoptionRule,
     FenceRule,
     LimitRule,
     RestartRule,
@@ -42,6 +43,7 @@ class LaunchOrder:
         limits: limits and scheduling.
         last_contact: of the master with this host, monotonic; 0.0: now.
         secrets: variable to the path of a file, which the supervisor reads at each start.
+        adoption: the process that becomes the first run; None: the first run is started.
     """
 
     instance: InstanceId
@@ -55,6 +57,7 @@ class LaunchOrder:
     last_contact: float = 0.0
     limits: LimitRule = field(default_factory=LimitRule)
     secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
+    adoption: AdoptionRule | None = None
 
 
 @dataclass(frozen=True, slots=True)

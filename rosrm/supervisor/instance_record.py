@@ -199,13 +199,16 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "fenced": messages.read_text,
     "kill_by": _optional_time,
     "withdrawn": bool,
+    "adopted": bool,
     "peak_memory": messages.read_amount,
     "cpu_time": messages.read_amount,
     "run_time": messages.read_amount,
     "message": messages.read_text,
 }
 #: Fields that may be missing in older records.
-_NEW_FIELDS: Final = frozenset({"enforced", "fault", "fenced", "heard", "kill_by", "withdrawn"})
+_NEW_FIELDS: Final = frozenset(
+    {"adopted", "enforced", "fault", "fenced", "heard", "kill_by", "withdrawn"}
+)
 
 
 class InstanceRecord:

@@ -89,6 +89,23 @@ class LogKeeper:
             own_log.write(f"an old log cannot be removed: {error}")
         return log
 
+    def note_adoption(self, instance: Key, known: Collection[Key], pid: int) -> None:
+        """Write into the log of an adopted process where its output goes."""
+        try:
+            output = os.readlink(f"/proc/{pid}/fd/1")
+        except OSError:
+            output = "its former output"
+        text = (
+            f"rosrm: process {pid} was adopted, and still writes to {output}, not to this log; "
+            "its output is here from its first restart on\n"
+        )
+        try:
+            log = self.open(instance, known)
+            with open(log, "wb") as file:
+                file.write(os.fsencode(text))
+        except OSError as error:
+            own_log.write(f"the log of an adopted process cannot be written: {error}")
+
     def watch(self, instance: Key, now: float, started: int = 0) -> None:
         """Begin to check the log of a running instance.
 

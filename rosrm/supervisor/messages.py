@@ -10,7 +10,7 @@ The client sends orders; the key `do` names the order:
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo, limits,
-                 secrets
+                 secrets, adoption
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
@@ -20,6 +20,8 @@ The client sends orders; the key `do` names the order:
                                                 limits: the fields of `LimitRule`, in their order
                                                 secrets: variable to the path of a file, whose
                                                 content is read at each start and never recorded
+                                                adoption: null, or [pid, birth, boot] of a process
+                                                that runs and becomes the first run
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -43,7 +45,8 @@ The client sends orders; the key `do` names the order:
 
 The supervisor sends messages; the key `tell` names the message:
 
-    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets, amends
+    welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets,
+                 amends, adopts
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
@@ -53,6 +56,7 @@ The supervisor sends messages; the key `tell` names the message:
                                                    the control groups of instances are
                                                    secrets: true, for it reads them at each start
                                                    amends: true: it can change limits
+                                                   adopts: true: it can adopt processes
     status       status                            a change, or the answer to a repeated order
     amended      instance, restart, limits,        the amendment is recorded; its status came before
                  refusal                           refusal: "", or why nothing has changed
@@ -73,6 +77,7 @@ from typing import Any, Final, NamedTuple
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.rules import (
+    AdoptionRule,
     FenceRule,
     Key,
     LimitRule,
@@ -90,6 +95,8 @@ UNREADABLE: Final = (KeyError, TypeError, ValueError, AttributeError, OverflowEr
 
 #: Largest number in a message: that of an instance is an unsigned integer of 64 bits.
 _MOST_NUMBER: Final = 2**64 - 1
+#: Largest id of a process.
+_LARGEST_PID: Final = 2**31 - 1
 #: Largest number of a CPU.
 _MOST_CPU: Final = 65_535
 #: Largest time or amount in a message, so that sums stay finite.
@@ -126,6 +133,7 @@ class Launch(NamedTuple):
     heard: float = 0.0
     limits: LimitRule = LimitRule()
     secrets: Mapping[str, str] = MappingProxyType({})
+    adoption: AdoptionRule | None = None
 
     def amended(self, amendment: Amend) -> Launch:
         """Return this launch as it is after an amendment."""
@@ -274,6 +282,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         read_time(fields.get("heard", 0.0)),
         read_limits(fields.get("limits", ())),
         read_texts(fields.get("secrets", {})),
+        _adoption(fields.get("adoption")),
     )
 
 
@@ -411,6 +420,13 @@ def _wait(value: Any) -> float:
     return min(read_amount(value), LONGEST)
 
 
+def _adoption(value: Sequence[Any] | None) -> AdoptionRule | None:
+    if value is None:
+        return None
+    pid, birth, boot = value
+    return AdoptionRule(read_whole(pid, 1, _LARGEST_PID), read_whole(birth, 0), read_text(boot))
+
+
 def _limits(fields: Mapping[str, Any]) -> LogLimits:
     max_bytes, keep, instances, processes = map(read_whole, fields["log"])
     keep_bytes = read_whole(
@@ -437,7 +453,7 @@ def encode_welcome(
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
     return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups,
-                 "secrets": True, "amends": True})  # fmt: skip
+                 "secrets": True, "amends": True, "adopts": True})  # fmt: skip
 
 
 def encode_status(status: Status) -> bytes:

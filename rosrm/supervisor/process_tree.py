@@ -50,6 +50,7 @@ class ProcessTrees:
         self._births: dict[Key, int] = {}
         self._children: dict[int, Key] = {}
         self._taken_over: dict[int, int] = {}
+        self._in_foreign_session: set[Key] = set()
         self._looked_at: dict[int, tuple[Key, int]] = {}
         self._next_look = 0.0
         self._most_watched = descriptors.most_watched()
@@ -64,13 +65,23 @@ class ProcessTrees:
         self._add(key, pid, birth)
 
     def take_over(self, key: Key, leader: Stat) -> bool:
-        """Add a session leader that an earlier supervisor spawned; return False if it has ended."""
+        """Add a leader that this supervisor did not spawn; return False if it has ended.
+
+        An earlier supervisor spawned it, or it is adopted.
+        """
         try:
             pidfd = os.pidfd_open(leader.pid) if self._has_room() else _NO_PIDFD
         except ProcessLookupError:
             return False
+        now = procfs.read_stat(leader.pid)
+        if now is None or not procfs.was_born(now, leader.start):
+            if pidfd != _NO_PIDFD:
+                os.close(pidfd)
+            return False  # it ended, and its pid was given to another process
         self._taken_over[leader.pid] = pidfd
         self._add(key, leader.pid, leader.start)
+        if leader.session != leader.pid:  # it is adopted
+            self._in_foreign_session.add(key)
         if pidfd == _NO_PIDFD:
             self._looked_at[leader.pid] = (key, leader.start)
         else:
@@ -92,6 +103,13 @@ class ProcessTrees:
         """Return the time at which `look` has work; None: never."""
         return self._next_look if self._looked_at else None
 
+    def owner_of(self, pid: int) -> Key | None:
+        """Return the instance whose leader is a process or one of its ancestors; None: of none."""
+        while pid > 1 and pid not in self._owners:
+            stat = procfs.read_stat(pid)
+            pid = 0 if stat is None else stat.parent
+        return self._owners.get(pid)
+
     def birth(self, key: Key) -> int:
         """Return the start time of the instance's leader in clock ticks; 0: not known."""
         return self._births.get(key, 0)
@@ -101,6 +119,7 @@ class ProcessTrees:
         session = self._sessions.pop(key, 0)
         self._owners.pop(session, None)
         self._births.pop(key, None)
+        self._in_foreign_session.discard(key)
 
     def _add(self, key: Key, pid: int, birth: int) -> None:
         self.release(key)
@@ -112,10 +131,9 @@ class ProcessTrees:
         pidfd = self._taken_over.pop(pid)
         if pidfd != _NO_PIDFD:
             self._unwatch(pidfd)
-        left = self._left(key, pid)
-        self.watch_strays(key, left)
-        memory = self._groups.out_of_memory(key)
-        self._happened(Exited(key, UNKNOWN_EXIT, leftovers=bool(left), out_of_memory=memory))
+        self.watch_strays(key, self._left(key, pid))
+        left, memory = key in self._strays, self._groups.out_of_memory(key)
+        self._happened(Exited(key, UNKNOWN_EXIT, leftovers=left, out_of_memory=memory))
 
     # --- reaping ------------------------------------------------------------------------------
 
@@ -165,6 +183,8 @@ class ProcessTrees:
 
     def _left(self, key: Key, leader: int) -> list[Stat]:
         """Return the living processes of an instance whose leader has ended."""
+        if key in self._in_foreign_session:
+            return _below(leader)
         found = self.in_group(key)
         return procfs.find_members(leader, mark(key), self._state) if found is None else found
 
@@ -244,11 +264,23 @@ class ProcessTrees:
             self._groups.kill(key)  # also processes that left session and process group
         session = self._sessions.get(key, 0)
         if session in self._children or session in self._taken_over:
-            _send(os.killpg, session, number, f"the group {session}")
+            self._signal_leader(key, session, number)
         if key in self._strays:
             self.watch_strays(key, self._find(key))
             for pidfd in self._strays.get(key, {}).values():
                 _send(signal.pidfd_send_signal, pidfd, number, "a left-over process")
+
+    def _signal_leader(self, key: Key, leader: int, number: int) -> None:
+        """Send a signal to the process group of a leader.
+
+        The group of an adopted process may have others, such as the script that started it. So the
+        signal goes to the process alone, and its descendants are watched as strays.
+        """
+        if key not in self._in_foreign_session:
+            _send(os.killpg, leader, number, f"the group {leader}")
+            return
+        self.watch_strays(key, _below(leader))
+        _send(os.kill, leader, number, str(leader))
 
     def kill(self, found: Iterable[Stat]) -> None:
         """Send SIGKILL to processes that belong to no instance any more."""
@@ -267,6 +299,12 @@ class ProcessTrees:
     def _unwatch(self, pidfd: int) -> None:
         self._selector.unregister(pidfd)
         os.close(pidfd)
+
+
+def _below(pid: int) -> list[Stat]:
+    """Return the living descendants of a process."""
+    found = map(procfs.read_stat, procfs.descendants(pid))
+    return [stat for stat in found if stat is not None and stat.alive]
 
 
 def mark(key: Key) -> str:

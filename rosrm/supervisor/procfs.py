@@ -7,6 +7,7 @@ the supervisor puts into each environment. Only a daemon that also cleans its en
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import time
@@ -19,6 +20,8 @@ _TICKS_PER_SECOND: Final = os.sysconf("SC_CLK_TCK")
 INSTANCE_MARK = "ROSRM_INSTANCE"
 SUPERVISOR_MARK = "ROSRM_SUPERVISOR"
 
+#: Flag of the kernel's own threads (PF_KTHREAD).
+_KERNEL_THREAD: Final = 0x200000
 #: Longest duration of an execve, and the interval between two checks of one, seconds.
 _EXECVE: Final = 1.0
 _LOOK: Final = 0.001
@@ -33,6 +36,12 @@ class Stat(NamedTuple):
     group: int
     session: int
     start: int
+    flags: int = 0
+
+    @property
+    def is_kernel_thread(self) -> bool:
+        """Return True for a thread of the kernel, which has no program."""
+        return bool(self.flags & _KERNEL_THREAD)
 
     @property
     def alive(self) -> bool:
@@ -50,8 +59,9 @@ def read_stat(pid: int) -> Stat | None:
     # The second field, the name in brackets, may itself hold spaces and brackets.
     fields = text[text.rindex(b")") + 2 :].split()
     return Stat(
-        pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19])
-    )
+        pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19]),
+        int(fields[6]),
+    )  # fmt: skip
 
 
 def inner_pid(pid: int, thread: int = 0) -> int:
@@ -186,6 +196,45 @@ def own_children() -> list[int]:
             return [int(pid) for pid in file.read().split()]
     except FileNotFoundError:  # a kernel without CONFIG_PROC_CHILDREN
         return [stat.pid for stat in everyone() if stat.parent == me]
+
+
+def descendants(pid: int) -> list[int]:
+    """Return the pids of a process's children, of their children, and so on; not its own."""
+    found = [pid]
+    for one in found:  # grows
+        found += _children_of(one)
+    return found[1:]
+
+
+def _children_of(pid: int) -> list[int]:
+    """Return the pids of the children of all threads of a process; [] if it has ended."""
+    found: list[bytes] = []
+    with contextlib.suppress(OSError):
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            with open(f"/proc/{pid}/task/{thread}/children", "rb") as file:
+                found += file.read().split()
+    return [int(child) for child in found]
+
+
+def command_line(pid: int) -> list[str]:
+    """Return the words of a process's command line; [] if it has none, or has ended."""
+    try:
+        with open(f"/proc/{pid}/cmdline", "rb") as file:
+            text = file.read()
+    except OSError:
+        return []
+    return [os.fsdecode(word) for word in text.removesuffix(b"\0").split(b"\0")] if text else []
+
+
+def user_ids(pid: int) -> set[int]:
+    """Return the real, effective and saved user id of a process; empty if it has ended."""
+    try:
+        with open(f"/proc/{pid}/status", "rb") as file:
+            text = file.read()
+    except OSError:
+        return set()
+    line = next(line for line in text.splitlines() if line.startswith(b"Uid:"))
+    return {int(word) for word in line.split()[1:4]}
 
 
 def boot_id() -> str:

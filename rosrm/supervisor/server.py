@@ -21,9 +21,10 @@ from rosrm.core.supervisor import commands, events
 from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
-from rosrm.core.supervisor.rules import Key
+from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.runtime.oom_score import score_of_children
 from rosrm.supervisor import (
+    adoption,
     descriptors,
     lease_file,
     messages,
@@ -42,6 +43,7 @@ from rosrm.supervisor.json_lines import ProtocolError
 from rosrm.supervisor.logs import LogKeeper, LogLimits
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
+from rosrm.wording import listed
 
 #: Most spawns before the loop looks at other events.
 SPAWNS_A_ROUND: Final = 8
@@ -206,6 +208,10 @@ class Server:
                 self._spawn_failed(key, failed, transient=True)
 
     def _spawn(self, key: Key) -> None:
+        launch = self._launches.get(key)
+        if launch is not None and launch.adoption and not self._core.instances[key].started:
+            self._adopt(key, launch, launch.adoption)
+            return
         birth = procfs.ticks_now()
         try:
             pid, enforced, note = self._spawn_process(key)
@@ -215,6 +221,22 @@ class Server:
         self._trees.add_child(key, pid, birth)
         self._logs.watch(key, time.monotonic(), pid)
         self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
+
+    def _adopt(self, key: Key, launch: messages.Launch, rule: AdoptionRule) -> None:
+        """Take over a process that runs, instead of the first start of an instance."""
+        try:
+            leader = adoption.check(rule, self._trees.owner_of)
+        except spawn.SpawnError as error:
+            self._spawn_failed(key, str(error), error.transient)
+            return
+        if not self._trees.take_over(key, leader):
+            self._spawn_failed(key, adoption.ended(rule), transient=False)
+            return
+        self._logs.note_adoption(key, self._core.instances, rule.pid)
+        self._logs.watch(key, time.monotonic(), rule.pid)
+        wanted = launch.limits.wanted
+        note = f"adopted, so only its first restart applies {listed(wanted)}" if wanted else ""
+        self._happened(Spawned(key, rule.pid, (), note, adopted=True))
 
     def _spawn_failed(self, key: Key, reason: str, transient: bool) -> None:
         """Report a failure. All clients may read the reason, so STATE stands for the directory."""

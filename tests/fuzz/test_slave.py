@@ -87,6 +87,7 @@ RULES: dict[str, Any] = {
     "heard": st.none() | SECONDS, "enforced": st.lists(texts, max_size=3).map(tuple), "note": texts,
     "out_of_memory": st.none() | st.tuples(floats, floats),
     "kill": st.booleans(), "transient": st.booleans(), "leftovers": st.booleans(),
+    "adopted": st.booleans(),
     "restart": st.builds(RestartRule, WHEN, SECONDS, SECONDS, SECONDS, NUMBERS, SECONDS),
     "stop": st.builds(StopRule, SECONDS, SECONDS),
     "held": st.none() | st.lists(texts, max_size=3).map(tuple),

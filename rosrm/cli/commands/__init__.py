@@ -22,6 +22,7 @@ import typer
 from typer.models import CommandInfo
 
 from rosrm.cli.commands import (
+    adopt,
     applications,
     change,
     check,
@@ -128,7 +129,7 @@ def common(
     ctx.obj = CommonOptions(domain, cluster)
 
 
-for module in (up, runtimes, applications, modes, change, inspect, follow):
+for module in (up, runtimes, applications, modes, change, adopt, inspect, follow):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
 app.command(cls=PlainCommand, context_settings={"allow_interspersed_args": False})(run.run)

@@ -9,6 +9,7 @@ requests.py    requests of clients; rights.py, quotas.py, contradictions.py, pro
 answers.py     answers of slaves to orders; reloading.py
 garbage.py     removal of what has ended from memory and journal
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
+adoption.py    a process that runs before it is submitted
 start_order.py starts after other processes, stops before them; dependants.py
 consequences.py the end of each step: what a change makes possible or necessary
 listing.py     rows of the listings, `rosrm explain`; plugin_failures.py

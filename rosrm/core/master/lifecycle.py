@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
-from rosrm.core.master import dependants
+from rosrm.core.master import adoption, dependants
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
 from rosrm.core.master.assignment.reservations import learn_from, settle_reservation
@@ -151,6 +151,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     if status.state in _ALIVE and not process.began:
         _note_start(state, process, now)
+    adoption.note_running(state, process, instance)
     _note_restarts(state, process, status, before, pid)
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_owner(state, process, instance, now)
@@ -356,13 +357,17 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     """Finish or requeue a process outside a migration, after its owning instance has ended."""
     if failover.take_over(state, process, end, now):
         return
-    status = end.status
+    status, pending = end.status, adoption.is_pending(process)
     process.owner = 0
     process.ran_on = host.name if status.run_time > 0.0 else ""
     process.exit_code = None if end.gone else status.known_exit
+    if pending:
+        adoption.end_adoption(state, process)
     if process.wanted is DesiredState.CANCEL and not (process.overdue and end.completed):
         phase, reason = cancelled_as(process)
         _finish(state, process, phase, host, now, reason)
+    elif pending:
+        _finish(state, process, ProcessPhase.FAILED, host, now, status.message)
     elif end.gone:
         _requeue(state, process, host, now, status.message)
     elif end.ordered:

@@ -12,7 +12,7 @@ from rosrm.model.values import Kind, ProcessSpec
 #: Fields that identify a process, its program and its kind, and so have no default of the cluster.
 IDENTITY: Final = (
     "namespace", "node_name", "package", "executable", "module", "command", "prefix", "ros", "kind",
-    "container", "parameter_sources", "lifecycle", "components",
+    "container", "parameter_sources", "lifecycle", "components", "adoption",
 )  # fmt: skip
 #: Fields that relate the processes of one file to each other, and so have none, either.
 _OF_ONE_FILE: Final = (

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Final
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.adoption import check_adoption
+from rosrm.core.master.assignment.assign import assign_to_adopt, reconsider_set_aside
 from rosrm.core.master.assignment.gangs import check_gangs
 from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.checkpoint import image_requests
@@ -34,6 +35,8 @@ from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import container_conflict, no_standby
 from rosrm.extensions.plugin_calls import implements, required
+from rosrm.model.adoption import NO_ADOPTION
+from rosrm.model.adoption_rules import adoption_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.limits import limits_fault
 from rosrm.model.orders import RestartInstance
@@ -68,7 +71,12 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_gangs(state, specs, event.by.name)
     check_quota(state, specs, event.by)
+    for spec in specs:
+        check_adoption(state, spec.adoption, now)
     processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
+    for process in processes:
+        if process.spec.adoption != NO_ADOPTION:
+            assign_to_adopt(state, process, now)
     nodes, names = {one.node for one in processes}, {one.name for one in processes}
     users = [one for one in state.processes.values() if one.node in nodes]
     others = [one for one in users if not one.phase.is_terminal and one.name not in names]
@@ -217,7 +225,7 @@ def _shared_container(state: MasterState, submitted: Sequence[ProcessSpec]) -> s
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
     """Return why limits, migration, standby or container of a spec are refused; "": not."""
-    fault = limits_fault(spec)
+    fault = limits_fault(spec) or adoption_fault(spec)
     if fault:
         return fault
     strategy = spec.migration.strategy

@@ -98,12 +98,14 @@ class Spawned(NamedTuple):
     Attributes:
         enforced: names of its limits and scheduling settings that hold.
         note: text on limits that do not hold.
+        adopted: it ran before, and was not started by this order.
     """
 
     instance: Key
     pid: int
     enforced: tuple[str, ...] = ()
     note: str = ""
+    adopted: bool = False
 
 
 class SpawnFailed(NamedTuple):

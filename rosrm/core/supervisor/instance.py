@@ -61,13 +61,14 @@ class Instance:
         fenced: text on why it was fenced; "": not fenced, or already being stopped for good.
         kill_by: latest time of SIGKILL after it was fenced; None: not fenced.
         withdrawn: the shutdown of the supervisor stops it, not an order of the client.
+        adopted: its last run was started without rosrm, so its exit code is never known.
     """
 
     __slots__ = (
-        "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault", "fence", "fenced",
-        "heard", "key", "kill_by", "kills", "message", "peak_memory", "phase", "pid", "recent",
-        "restart", "restarts", "run_time", "started", "step", "stop", "stop_began", "then", "trail",
-        "withdrawn",
+        "adopted", "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault",
+        "fence", "fenced", "heard", "key", "kill_by", "kills", "message", "peak_memory",
+        "phase", "pid", "recent", "restart", "restarts", "run_time", "started", "step",
+        "stop", "stop_began", "then", "trail", "withdrawn",
     )  # fmt: skip
 
     def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
@@ -79,6 +80,7 @@ class Instance:
         self.fenced = ""
         self.kill_by: float | None = None
         self.withdrawn = False
+        self.adopted = False
         self.phase: Phase = STARTING
         self.then: Then = ""
         self.pid = 0
@@ -142,6 +144,8 @@ def ending(instance: Instance) -> str:
         return instance.fault
     if instance.exit_signal:
         return f"killed by {signal_name(instance.exit_signal)}"
+    if instance.exit_code == UNKNOWN_EXIT and instance.adopted:
+        return "ended; its exit code is not known, because rosrm did not start this run"
     if instance.exit_code == UNKNOWN_EXIT:
         return "ended while its host or its supervisor was down: its exit code is not known"
     return f"exit code {instance.exit_code}"

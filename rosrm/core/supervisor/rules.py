@@ -77,6 +77,14 @@ class LimitRule(NamedTuple):
         return self if limits is None else self._replace(**limits._asdict())
 
 
+class AdoptionRule(NamedTuple):
+    """Lightweight copy of `rosrm.model.adoption.Adoption`, without the host."""
+
+    pid: int
+    birth: int
+    boot: str
+
+
 class FenceRule(NamedTuple):
     """Lightweight copy of `rosrm.model.values.Fence`."""
 

@@ -52,6 +52,7 @@ def _spawned(instance: Instance, event: events.Event, now: float) -> list[Comman
     instance.started = now
     instance.message, instance.fault = event.note, ""
     instance.enforced = event.enforced
+    instance.adopted = event.adopted
     if instance.then == THEN_END:
         return _stop(instance, event, now)
     return [ReportStatus(instance.key)]

@@ -10,8 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from rosrm.core.supervisor.rules import AdoptionRule
 from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
+from rosrm.model.adoption import NO_ADOPTION, Adoption
 from rosrm.model.values import Assignment, ProcessSpec, RestartPolicy
 from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.artifacts import with_artifacts
@@ -82,7 +84,19 @@ def launch_order(
         last_contact=last_contact,
         limits=limit_rule(spec),
         secrets=spec.secrets,
+        adoption=_adoption(spec.adoption, where.host),
     )
+
+
+def _adoption(adoption: Adoption, host: str) -> AdoptionRule | None:
+    """Return the process that becomes the first run; None: the first run is started."""
+    if adoption == NO_ADOPTION:
+        return None
+    if adoption.host != host:
+        raise LaunchError(
+            f"process {adoption.pid} runs on {adoption.host}, so {host} cannot run it"
+        )
+    return AdoptionRule(adoption.pid, adoption.birth, adoption.boot)
 
 
 def _check_length(launch: Launch) -> None:

@@ -8,11 +8,13 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.errors import LaunchError
+from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
@@ -28,6 +30,11 @@ from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.supervisor.secret_files import is_exposed
 from rosrm.wording import one_line
+
+_CANNOT_ADOPT: Final = (
+    "a supervisor of an earlier version runs here, which adopts no process; it ends when all its "
+    "processes have ended"
+)
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -155,9 +162,10 @@ class Starter:
         for assignment in assignments:
             held = self.state.held[assignment.instance]
             if held.awaited is not None:
-                before = self.graph.endpoints(held.awaited.node_name)
+                before = self._seen_before(assignment, held.awaited.node_name)
                 self._graph_before[assignment.instance] = before
             try:
+                self._check_supervisor(assignment)
                 self._check_secrets(assignment)
                 order = launch_order(
                     assignment, self._environment, sys.executable, where=where,
@@ -169,6 +177,18 @@ class Starter:
                 self._refuse(assignment.instance, str(error))
         if orders:
             self.supervisor.start(orders)
+
+    def _seen_before(self, assignment: Assignment, node: str) -> frozenset[bytes]:
+        """Return the endpoints of a node that do not show that the instance is ready.
+
+        The node of a process that is adopted is in the graph already.
+        """
+        is_adopted = assignment.spec.adoption != NO_ADOPTION
+        return frozenset() if is_adopted else self.graph.endpoints(node)
+
+    def _check_supervisor(self, assignment: Assignment) -> None:
+        if assignment.spec.adoption != NO_ADOPTION and not self.supervisor.adopts:
+            raise LaunchError(f"{assignment.instance}: {_CANNOT_ADOPT}")
 
     def _check_secrets(self, assignment: Assignment) -> None:
         """Warn of secrets that every user of this host may read; raises `LaunchError`."""

@@ -11,6 +11,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.errors import Refused
 from rosrm.model import values
+from rosrm.model.adoption import Adoption
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros import control, convert
 from rosrm_msgs import msg
@@ -37,6 +38,13 @@ def test_spec_survives(spec) -> None:
     """A submitted spec is received unchanged, and its restart policy also apart from it."""
     assert survives(spec, "spec")
     assert survives(spec.restart, "restart")
+
+
+def test_an_adoption_survives() -> None:
+    """The slave gets the process that it adopts, with its start time."""
+    adoption = Adoption("a", 2**31 - 1, 2**53, "boot")
+    spec = values.ProcessSpec("p", command=("true",), adoption=adoption)
+    assert survives(spec, "spec")
 
 
 #: An assignment has a key of 32 bytes, or none.
@@ -276,6 +284,10 @@ NONSENSE_IN_SPECS = {
     "a secret that is also a variable": lambda m: (
         setattr(m, "secrets", variable("TOKEN", "/t")),
         setattr(m, "environment", variable("TOKEN", "x")),
+    ),
+    "an adoption of nothing": lambda m: setattr(m.adoption, "host", "a"),
+    "an adoption of the first process": lambda m: setattr(
+        m, "adoption", msg.Adoption(host="a", pid=1, birth=1, boot="b")
     ),
     "an engine without an image": lambda m: setattr(m.container, "engine", "podman"),
     "an option as an image": lambda m: setattr(

@@ -15,7 +15,14 @@ from rosrm.core.supervisor.events import (
     StatusStored,
     StopOrdered,
 )
-from rosrm.core.supervisor.rules import FenceRule, LimitRule, RestartRule, RunLimits, StopRule
+from rosrm.core.supervisor.rules import (
+    AdoptionRule,
+    FenceRule,
+    LimitRule,
+    RestartRule,
+    RunLimits,
+    StopRule,
+)
 from rosrm.supervisor import json_lines as ls
 from rosrm.supervisor import messages
 from rosrm.supervisor.logs import LogLimits
@@ -44,6 +51,7 @@ LIMITS = st.builds(
     st.integers(-20, 19),
     st.booleans(),
 )
+ADOPTIONS = st.builds(AdoptionRule, st.integers(2, 2**31 - 1), st.integers(0, 2**53), st.text())
 CHANGES = st.dictionaries(WORDS, st.none() | WORDS)
 ORDERS = st.one_of(
     st.builds(messages.Hello, WHOLE, WHOLE, st.just(LogLimits(1, 2, 3, 4, 5))),
@@ -62,6 +70,7 @@ ORDERS = st.one_of(
         SECONDS,
         LIMITS,
         st.dictionaries(WORDS, WORDS),
+        st.none() | ADOPTIONS,
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),

@@ -40,7 +40,8 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.values import EMPTY
+from rosrm.model.orders import StartInstance
+from rosrm.model.values import EMPTY, Assignment
 from rosrm.wording import counted, listed
 
 _AWAY: Final = (HostCondition.EXPECTED, HostCondition.LOST, HostCondition.DETACHED)
@@ -347,6 +348,15 @@ def _decide_jointly(
 def _assign(
     state: MasterState, process: Process, ranking: Ranking, decision: Decision, now: float
 ) -> None:
+    assignment = _take_place(state, process, ranking, decision, now)
+    host = state.hosts.hosts[decision.column]
+    state.emit(Assign(host.host_id, assignment))
+
+
+def _take_place(
+    state: MasterState, process: Process, ranking: Ranking, decision: Decision, now: float
+) -> Assignment:
+    """Give a queued process the place of a decision, and return its assignment."""
     column = decision.column
     host = state.hosts.hosts[column]
     instance = state.new_instance_id(process)
@@ -366,7 +376,18 @@ def _assign(
     )  # fmt: skip
     state.save(process)
     note_restart(state, process)
-    state.emit(Assign(host.host_id, state.assignment(instance, process.spec)))
+    return state.assignment(instance, process.spec)
+
+
+def assign_to_adopt(state: MasterState, process: Process, now: float) -> None:
+    """Assign a process that runs already to its host, also if that has no room and asks for none.
+
+    So it is ordered, not kept for the next request of the host.
+    """
+    host = state.hosts.by_name[process.spec.adoption.host]
+    ranking = ranking_of(state, demand_of(state, process))
+    decision = decide(ranking, chosen=host.column)
+    state.send(host, StartInstance(_take_place(state, process, ranking, decision, now)))
 
 
 def _set_aside(state: MasterState, process: Process, reason: str, now: float) -> None:

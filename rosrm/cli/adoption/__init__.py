@@ -1,0 +1,1 @@
+"""Adoption of a running process, whose command line becomes an entry of a work file."""
