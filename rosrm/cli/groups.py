@@ -35,7 +35,7 @@ _ELSEWHERE: Final = {
 #: Command to the distribution that has it.
 DISTRIBUTIONS: Final = {
     "alerts": "rosrm-alerts", "criu": "rosrm-criu", "lab": "rosrm-lab", "launch": "rosrm-launch",
-    "simulate": "rosrm-simulate", "web": "rosrm-web",
+    "metrics": "rosrm-web", "simulate": "rosrm-simulate", "web": "rosrm-web",
 }  # fmt: skip
 #: Width in which no summary of a command is cut.
 _UNCUT: Final = 1000

@@ -152,6 +152,7 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
         ("alerts", "rosrm-alerts"),
         ("lab", "rosrm-lab"),
         ("launch", "rosrm-launch"),
+        ("metrics", "rosrm-web"),
         ("simulate", "rosrm-simulate"),
         ("web", "rosrm-web"),
     ],

@@ -13,6 +13,7 @@ from rosrm.version import __version__
 from rosrm_web import problems
 from rosrm_web.acting import WORK_TYPES, Acting, Message
 from rosrm_web.changes import Changes
+from rosrm_web.metrics.endpoint import Metrics
 from rosrm_web.reading import Host, Log, Reading, Status
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def routes(gateway: Gateway) -> list[Route]:
         Route("GET", "/v1/changes", Changes(gateway).follow, None),
         Route("GET", "/v1/explain/{process}", read.explain, dict[str, Any]),
         Route("GET", "/v1/logs/{process}", read.logs, Log),
+        Route("GET", "/metrics", Metrics(gateway).metrics, None),
         Route("POST", "/v1/submit", act.submit, Message),
         Route("POST", "/v1/apply", act.apply, ApplyResult),
         Route("POST", "/v1/plan", act.plan, ApplyResult),

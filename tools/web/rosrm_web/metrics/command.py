@@ -1,0 +1,99 @@
+"""The command `rosrm metrics`."""
+
+# What only some calls need is imported when they run, so that `rosrm --help` is quick.
+# ruff: noqa: PLC0415
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from rosrm.cli import connection
+from rosrm.cli.options import Domain, seconds_of
+from rosrm.errors import ConfigError, NoMaster
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm_web.metrics.counting import EventMetrics
+
+#: Mode of the file: the node exporter runs as another user.
+_READABLE = 0o644
+
+
+def metrics(
+    ctx: typer.Context,
+    textfile: Annotated[
+        Path | None,
+        typer.Option(
+            "--textfile", metavar="FILE", help="Write FILE, e.g. rosrm.prom; default: print them."
+        ),
+    ] = None,
+    every: Annotated[
+        str,
+        typer.Option(
+            "--every", metavar="TIME", help="Repeat until Ctrl-C, e.g. 15s, and count events too."
+        ),
+    ] = "",
+    domain: Domain = None,
+) -> None:
+    """Print metrics of the cluster for Prometheus.
+
+    With --textfile, the textfile collector of the node exporter reads them. `rosrm web` serves the
+    same metrics at /metrics.
+    """
+    from rosrm_web.metrics.counting import EventMetrics
+
+    period = seconds_of("--every", every) if every else 0.0
+    if every and textfile is None:
+        raise ConfigError("--every: give the file too: --textfile FILE")
+    with connection.master(ctx, domain) as client:
+        counted = EventMetrics() if period else None
+        after = client.list().last_sequence if period else 0
+        while True:
+            content, after = _look(client, counted, after, is_repeated=bool(period))
+            _write(content, textfile)
+            if not period:
+                return
+            time.sleep(period)
+
+
+def _look(
+    client: Client, counted: EventMetrics | None, after: int, *, is_repeated: bool
+) -> tuple[bytes, int]:
+    """Return the metrics, and the sequence of the newest event."""
+    from rosrm_web.metrics.exposition import exposition
+    from rosrm_web.watching import MOST_EVENTS
+
+    begun = time.monotonic()
+    try:
+        listing = client.list(
+            hosts=True, processes=True, applications=True, plugins="failing",
+            events=counted is not None, after=after, newest=MOST_EVENTS,
+        )  # fmt: skip
+    except NoMaster:
+        if not is_repeated:
+            raise
+        return exposition(None, 0.0, counted), after
+    if counted is not None:
+        counted.count(listing.events)
+    return exposition(listing, time.monotonic() - begun, counted), listing.last_sequence
+
+
+def _write(content: bytes, textfile: Path | None) -> None:
+    if textfile is None:
+        sys.stdout.write(content.decode())
+        return
+    new = textfile.with_name(f"{textfile.name}.new")  # the collector reads *.prom only
+    try:
+        new.write_bytes(content)
+        new.chmod(_READABLE)
+        new.replace(textfile)
+    except OSError as error:
+        with suppress(OSError):
+            new.unlink()
+        raise ConfigError(f"--textfile {textfile}: cannot be written: {error.strerror}") from None

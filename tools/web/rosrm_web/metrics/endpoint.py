@@ -1,0 +1,41 @@
+"""GET /metrics."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING
+
+from fastapi.responses import Response
+
+from rosrm.errors import NoMaster
+from rosrm_web.metrics.counting import EventMetrics
+from rosrm_web.metrics.exposition import MEDIA_TYPE, exposition
+
+if TYPE_CHECKING:
+    from rosrm.model.rows import Listing
+    from rosrm_web.gateway import Gateway
+
+
+class Metrics:
+    """Endpoint with the metrics; counts the events from now on."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        self._gateway = gateway
+        self._counted = EventMetrics()
+        gateway.watcher.on_events.append(self._counted.count)
+
+    async def metrics(self) -> Response:
+        """Return all metrics as text for Prometheus, also while the master is lost."""
+        listing: Listing | None = None
+        begun = time.monotonic()
+        with suppress(NoMaster):
+            listing = await self._gateway.list(
+                hosts=True, processes=True, applications=True, plugins="failing"
+            )
+        seconds = time.monotonic() - begun
+        write = partial(exposition, listing, seconds, self._counted)
+        content = await asyncio.get_running_loop().run_in_executor(None, write)
+        return Response(content, media_type=MEDIA_TYPE)
