@@ -1,16 +1,28 @@
-"""Rules on the components that a slave loads into a container."""
+"""Rules on the components that a slave loads into a container, and on those that are processes."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from typing import Final
 
 from rosrm.model.description_checks import is_namespace, is_node_name, node_name_fault
 from rosrm.model.values import ProcessSpec
 
+#: Module of a process that stands for a component.
+_PROCESS: Final = "rosrm.component"
+
 
 def components_fault(spec: ProcessSpec) -> str:
-    """Return why the slave cannot load the components of a process; "" if it can."""
+    """Return why no slave can load the components of a process; "" if one can.
+
+    A process that stands for one component names it in its arguments.
+    """
+    if spec.module == _PROCESS and (not spec.ros or len(spec.arguments) < 2):
+        return (
+            f"module: {_PROCESS} needs `ros: true` and `arguments: [CONTAINER, PLUGIN]`, as "
+            "[box, 'my_robot.nodes:Counter']"
+        )
     return next(_faults(spec), "") if spec.components else ""
 
 

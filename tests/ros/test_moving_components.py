@@ -105,7 +105,7 @@ class Feed:
 
 
 def await_next(cluster: Cluster, stage: Stage, before: ProcessRow) -> ProcessRow:
-    """Wait until another instance of a process runs, while the stage goes on."""
+    """Wait until another instance of a process runs, while the stage spins."""
 
     def rows() -> list[ProcessRow]:
         found = cluster.client.list(processes=True).processes
@@ -165,7 +165,7 @@ def test_another_version_of_a_component_names_another_container(cluster, stage) 
     ],
 )
 def test_a_component_stays_if_it_cannot_be_loaded_there(cluster, stage, name, fields, said) -> None:
-    """The source goes on counting in its container, in the same process."""
+    """The source keeps counting in its container, in the same process."""
     if name == "local":
         cluster.submit(container("only_a", "a", "only_a"))
         cluster.wait("only_a", "running")
@@ -232,6 +232,21 @@ def test_components_start_again_with_their_container(cluster) -> None:
     cluster.wait("inmate", "running", where=lambda one: one.restarts > row.restarts)
     assert "the container 'box' has ended" in cluster.log("inmate")
     cluster.cancel("inmate")
+
+
+def test_a_second_container_of_a_name_on_a_host_follows_the_first(cluster) -> None:
+    """It warns, and gets the components when the first one has ended."""
+    cluster.submit(container("first", "a", "twin"))
+    cluster.wait("first", "running")
+    cluster.submit(container("second", "a", "twin"))
+    cluster.wait("second", "running")
+    cluster.wait_for_log("second", "another container 'twin' runs on this host")
+    cluster.submit(component("child", box="twin", required_labels={"at": "a"}))
+    row = cluster.wait("child", "running")
+    cluster.cancel("first")
+    wait_gone(row.pid)
+    cluster.wait("child", "running", where=lambda one: one.restarts > row.restarts)
+    cluster.cancel("child", "second")
 
 
 def test_a_component_that_cannot_be_loaded_has_failed(cluster) -> None:

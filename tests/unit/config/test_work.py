@@ -498,6 +498,8 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ),
         ("name: a, module: x, ros: true, lifecycle: on", "autostart"),
         ("name: a, command: x, components: [{plugin: p, name: c}]", "set `ros: true`"),
+        ("name: a, module: rosrm.component, arguments: [b, 'm:C']", "needs `ros: true` and"),
+        ("name: a, module: rosrm.component, ros: true, arguments: [b]", "[CONTAINER, PLUGIN]"),
         (
             "name: a, module: x, ros: true, components: [&c {plugin: p, name: c}, *c]",
             "/c is there twice",
