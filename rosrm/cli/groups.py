@@ -35,7 +35,8 @@ _ELSEWHERE: Final = {
 #: Command to the distribution that has it.
 DISTRIBUTIONS: Final = {
     "alerts": "rosrm-alerts", "criu": "rosrm-criu", "lab": "rosrm-lab", "launch": "rosrm-launch",
-    "metrics": "rosrm-web", "simulate": "rosrm-simulate", "web": "rosrm-web",
+    "metrics": "rosrm-web", "report": "rosrm-report", "simulate": "rosrm-simulate",
+    "web": "rosrm-web",
 }  # fmt: skip
 #: Width in which no summary of a command is cut.
 _UNCUT: Final = 1000

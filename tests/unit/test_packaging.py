@@ -68,8 +68,8 @@ OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJEC
 
 def test_every_distribution_is_looked_at() -> None:
     parts = (
-        "checkpoint container criu examples lab launch migration msgs resources scoring simulate "
-        "web"
+        "checkpoint container criu examples lab launch migration msgs report resources scoring "
+        "simulate web"
     )
     assert {"rosrm", *(f"rosrm-{part}" for part in parts.split())} <= OWN
 

@@ -153,6 +153,7 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
         ("lab", "rosrm-lab"),
         ("launch", "rosrm-launch"),
         ("metrics", "rosrm-web"),
+        ("report", "rosrm-report"),
         ("simulate", "rosrm-simulate"),
         ("web", "rosrm-web"),
     ],

@@ -14,6 +14,7 @@ import yaml
 from typer.testing import CliRunner
 
 from rosrm.cli.commands import app
+from rosrm.cli.groups import DISTRIBUTIONS
 from rosrm.extensions.registry import Registry
 from rosrm.ros import names
 from tests import pages
@@ -160,7 +161,11 @@ def shown_commands(page: Path) -> Iterator[list[str]]:
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
 def test_every_command_that_is_shown_exists(page):
+    """Commands of a distribution that is not installed here cannot be compared."""
+    absent = set(DISTRIBUTIONS) - set(TREE.list_commands(None))
     for words in shown_commands(page):
+        if words[0] in absent:
+            continue
         group, here = TREE, list(words)
         options = {opt for parameter in group.params for opt in parameter.opts}
         while here and here[0].startswith("-"):

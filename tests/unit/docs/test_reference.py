@@ -15,6 +15,7 @@ import typer.main
 
 import rosrm
 from rosrm.cli.commands import app
+from rosrm.cli.groups import DISTRIBUTIONS
 from rosrm.config.cluster import load_cluster
 from rosrm.config.groups import GroupInFile
 from rosrm.config.host import load_host
@@ -254,8 +255,11 @@ def test_every_command_and_option_is_documented(name, command):
 
 
 def test_nothing_is_documented_that_is_no_command():
+    """Commands of a distribution that is not installed here cannot be compared."""
+    absent = set(DISTRIBUTIONS) - set(TREE.list_commands(None))
     documented = set(re.findall(r"^### `(rosrm [^`]+)`$", page("command-line.md"), re.MULTILINE))
-    assert documented == {name for name, _ in commands(TREE)}
+    installed = {name for name in documented if name.split()[1] not in absent}
+    assert installed == {name for name, _ in commands(TREE)}
 
 
 def test_the_common_options_are_documented():

@@ -53,6 +53,7 @@ class Outcome:
     """A run in numbers.
 
     Attributes:
+        first: time of the first arrival, by the master's monotonic clock; 0: there was none.
         processes: submitted and accepted.
         finished, running, waiting, ended_otherwise: numbers by state at the end; they add up to
             `processes`. Waiting: in the queue, or set aside because no host may take it.
@@ -69,6 +70,7 @@ class Outcome:
         events: number of events that the core processed.
     """
 
+    first: float
     processes: int
     finished: int
     running: int
@@ -241,7 +243,7 @@ class Meter:
         }
         seconds = totals.seconds or 1.0
         return Outcome(
-            processes=len(phases), finished=finished,
+            first=first, processes=len(phases), finished=finished,
             running=sum(phase not in waiting and not phase.is_terminal for phase in phases),
             waiting=sum(phase in waiting for phase in phases),
             ended_otherwise=over - finished,

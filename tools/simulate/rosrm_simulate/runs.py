@@ -16,19 +16,22 @@ from typing import Final
 from rosrm.config.documents import Node
 from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import ClusterConfig
+from rosrm.core.master.commands import Command
+from rosrm.core.master.master_state import MasterState
 from rosrm.errors import ConfigError, RecordError
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import PlacementPlugins
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import Quantity
+from rosrm.recording.encoding import Happened
 from rosrm.recording.frames import is_record
 from rosrm.recording.reader import Recording, read_record
 from rosrm_simulate.agreement import Agreement, compare
 from rosrm_simulate.engine import Progress, Simulation
 from rosrm_simulate.extraction import Extraction
 from rosrm_simulate.meter import Outcome
-from rosrm_simulate.replay import Replay, replay
+from rosrm_simulate.replay import Replay, Watcher, replay
 from rosrm_simulate.variants import (
     Variant,
     load_variants,
@@ -184,7 +187,10 @@ def load_record(path: Path, *, cut: bool = False) -> Recording:
 
 
 def replay_record(
-    recording: Recording, registry: Registry, until: float = inf
+    recording: Recording,
+    registry: Registry,
+    until: float = inf,
+    watcher: Watcher | None = None,
 ) -> tuple[Replay, Workload]:
     """Replay a record with its own settings, and make a workload of it.
 
@@ -192,6 +198,7 @@ def replay_record(
         recording: of a master's run; all of it is replayed, and goes into the workload.
         registry: of the plugins.
         until: seconds from the beginning, up to which the recorded run is measured.
+        watcher: is called with each event and its commands.
 
     Raises:
         RecordError: its settings do not fit this version.
@@ -205,13 +212,19 @@ def replay_record(
             f"{recording.header.software}): {fault}"
         ) from None
     extraction = Extraction(recording)
+
+    def watch(state: MasterState, one: Happened, commands: Sequence[Command]) -> None:
+        extraction.watch(state, one, commands)
+        if watcher is not None:
+            watcher(state, one, commands)
+
     placement, strategies, declared = _plugins(config, registry)
     replayed = replay(
         recording,
         config.core(),
         placement,
         strategies,
-        extraction.watch,
+        watch,
         until,
         declared=declared,
         chain_of=partial(chain_of, registry),

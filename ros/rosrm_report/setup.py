@@ -1,0 +1,1 @@
+../ament_python_setup.py
