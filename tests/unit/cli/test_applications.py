@@ -81,6 +81,17 @@ def test_an_apply_of_the_version_that_returned_succeeds(rosrm, client, work):
     assert (result.code, result.err) == (0, "")
 
 
+def test_an_apply_ends_when_a_process_of_a_first_version_finds_no_host(rosrm, client, work):
+    """Without a time-out, too: the application is degraded, and the reason is that of `apps`."""
+    why = "p is set aside: no host may take it: no host offers the container engine podman"
+    client.applications = [
+        replace(PAUSED, state="degraded", version=1, versions=(FIRST,), reason=why)
+    ]
+    client.apply = lambda *_, **__: ApplyResult("nav version 1: 1 process to start")
+    result = rosrm("apply", work)
+    assert (result.code, result.err) == (1, f"rosrm: nav is degraded at version 1: {why}\n")
+
+
 def test_the_end_of_the_time_for_an_apply_is_said(rosrm, client, work):
     """The application is still under way then."""
     client.applications = [replace(PAUSED, state="applying", reason="", pending={"p": "it starts"})]

@@ -81,7 +81,7 @@ class Applications(RuleBasedStateMachine):
 
     @initialize()
     def begin(self) -> None:
-        self.cluster = Cluster(*(Machine(name) for name in HOSTS))
+        self.cluster = Cluster(*(Machine(name) for name in HOSTS), progress_deadline=10.0)
         self.cluster.watch = self.judge
 
     # --- requests ------------------------------------------------------------------------

@@ -597,7 +597,7 @@ def test_what_may_wait_long_ends_no_version(spec: ProcessSpec) -> None:
 
 
 def test_without_a_deadline_a_process_waits_for_room() -> None:
-    """It starts with the new version once there is room, however late."""
+    """The new version starts once there is room, however late."""
     cluster = crowded(progress_deadline=0.0)
     cluster.apply("nav", new(process("p", 8_000)))
     cluster.wait(900.0, tick=1.0)
@@ -721,6 +721,45 @@ def test_the_refusal_of_a_name_says_how_it_gets_free(plan: bool) -> None:
     reply = cluster.apply("nav", process("q"), plan=plan)
     assert "it is being cancelled: try again once it has ended" in reply.message
     assert "nav" not in cluster.state.applications
+
+
+def test_one_request_has_each_name_once() -> None:
+    """Two files of one application, or two applications with one process: nothing is changed."""
+    cluster = Cluster("a")
+
+    def target(application: str, name: str) -> Target:
+        return Target(application, (process(name, application=application),))
+
+    for second, why in (
+        (target("nav", "q"), "the application nav is given twice: put all its processes into one"),
+        (target("map", "p"), "the process p is given twice: names are unique"),
+    ):
+        targets = (target("nav", "p"), second)
+        reply = cluster.ask(happened.ApplicationsRequested, targets, False)
+        assert (reply.accepted, reply.code) == (False, "name_taken")
+        assert reply.message.startswith(why)
+    assert not cluster.state.applications
+    assert not cluster.state.processes
+
+
+@pytest.mark.parametrize("kept", ["in its own application", "alone"])
+def test_a_dependency_on_what_is_cancelled_is_refused(kept: str) -> None:
+    """The file is refused as a whole, so the processes before run on."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    cluster.with_processes(process("single"))
+    cluster.wait(1.0)
+    name = "p" if kept == "in its own application" else "single"
+    if name == "single":
+        cluster.machines["a"].stubborn.add("single")
+        cluster.cancel("single")
+    late = process("q", start_order=StartOrder({name: "ready"}))
+    reply = cluster.apply("nav", *[process("p")] * (name == "single"), late)
+    assert (reply.accepted, state_of(cluster)) == (False, (1, []))
+    why = "no longer a process of its application" if name == "p" else "is being cancelled"
+    assert f"q: after: {name}" in reply.message
+    assert why in reply.message
+    assert cluster.phase("p") == "running"
 
 
 def test_an_operator_gives_no_process_of_one_user_to_the_application_of_another() -> None:

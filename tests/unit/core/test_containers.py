@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from rosrm.core.master.applications.listing import application_rows
 from rosrm.model.values import Container, HostDescription, MigrationPolicy
 from tests.unit.core.cluster import Cluster, Machine, process
 
@@ -36,6 +37,17 @@ def test_a_process_waits_until_a_host_offers_its_engine() -> None:
     assert (
         "no host offers podman for containers (only criu): install podman and its plugin" in reason
     )
+
+
+def test_an_application_says_that_no_host_offers_the_engine_of_a_process() -> None:
+    """The rest of its first version runs, and `rosrm apply` ends with the reason."""
+    cluster = Cluster(Offering("a"))
+    camera = process("camera", container=Container("ros:jazzy", "podman"))
+    cluster.apply("seeing", process("viewer"), camera)
+    cluster.wait(12.0)
+    (row,) = application_rows(cluster.state)
+    assert (row.state, row.running) == ("degraded", 1)
+    assert "camera is set aside: no host may take it: no host offers podman" in row.reason
 
 
 def test_a_container_cannot_move_by_a_strategy_that_moves_state() -> None:

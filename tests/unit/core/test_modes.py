@@ -322,7 +322,7 @@ def test_the_weights_of_a_mode_apply_while_it_is_in_force() -> None:
 
 
 def test_a_mode_says_which_of_its_applications_have_changed_since() -> None:
-    """It stays in force, also after a restart of the master; the same request restores it."""
+    """The mode stays in force, also in the next master; the same request restores it."""
     cluster = in_mode("exploring", EXPLORING, DOCKED)
     why = "map was cancelled since; `rosrm mode exploring` applies the mode again"
     assert cluster.apply("map").accepted

@@ -215,7 +215,7 @@ def test_a_job_that_changes_between_two_runs_waits_for_the_next_one(
 
 
 def test_a_job_that_loses_its_schedule_between_two_runs_runs_once() -> None:
-    """It is a job like any other from then on."""
+    """The job is like any other from then on."""
     cluster = Cluster("a")
     cluster.apply("app", job("p", schedule=EVERY_10_S))
     cluster.finish("p")
