@@ -330,7 +330,7 @@ class _Service:
         self._core, self._create, self._destroy, self._callback = core, create, destroy, callback
         self._service: Any = None
         self._send: Any = None
-        self._held: list[tuple[Any, _Held]] = []
+        self.held: list[tuple[Any, _Held]] = []
 
     def open(self) -> None:
         self._service = self._create(self._serve)
@@ -343,19 +343,19 @@ class _Service:
 
     def _answer(self, answer: Any, header: Any) -> None:
         if isinstance(answer, _Held):
-            self._held.append((header, answer))
+            self.held.append((header, answer))
         else:
             self._send(answer, header)
 
     def serve_held(self) -> bool:
-        if not self._held:
+        if not self.held:
             return False
-        header, held = self._held.pop(0)
+        header, held = self.held.pop(0)
         self._answer(self._serve(held.request, held.response), header)
         return True
 
     def close(self) -> None:
-        self._held.clear()
+        self.held.clear()
         self._destroy(self._service)
 
 
@@ -507,6 +507,13 @@ class Node(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
         """Number of buffered messages."""
         assert self._core is not None
         return self._core._library.node_buffered(ctypes.c_void_p(self._core._handle))
+
+    @property
+    def held_requests(self) -> int:
+        """Number of requests that wait for the end of a silence."""
+        assert self._core is not None
+        services = (one for one in self._core.openings if isinstance(one, _Service))
+        return sum(len(one.held) for one in services)
 
     def hold(self) -> None:
         """Prevent the activation of a destination."""

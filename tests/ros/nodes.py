@@ -112,6 +112,14 @@ def buffered(node: Any) -> int:
     return len(node._rosrm.entities.buffer) if isinstance(node, Node) else node.buffered
 
 
+def held_requests(node: Any) -> int:
+    """Return the number of requests that a silent node holds."""
+    if not isinstance(node, Node):
+        return node.held_requests
+    openings = node._rosrm.entities._openings
+    return sum(len(one._held) for one in openings if hasattr(one, "srv_name"))
+
+
 class Stage:
     """A ROS context with an executor, on which nodes run as instances of processes.
 

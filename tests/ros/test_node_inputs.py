@@ -11,13 +11,26 @@ from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
+from rosrm.node import Node
 from rosrm_msgs.msg import HandoffReport, StateConfig
-from tests.ros.nodes import ALIAS, RELIABLE, Conductor, Counter, Server, Stage, pair_of
+from tests.ros.nodes import (
+    ALIAS,
+    RELIABLE,
+    Conductor,
+    Counter,
+    Counting,
+    Server,
+    Serving,
+    Stage,
+    buffered,
+    held_requests,
+    pair_of,
+)
 
 R, C = HandoffReport, StateConfig
 
 
-class Listener(Counter):
+class Listening(Counting):
     """A counter that records messages on `in`, in order of arrival."""
 
     def __init__(self, group=None, work: float = 0.0, depth=RELIABLE, **named) -> None:
@@ -29,6 +42,16 @@ class Listener(Counter):
     def take(self, message: Int64) -> None:
         time.sleep(self.work)
         self.seen.append(message.data)
+
+
+class Listener(Listening, Node):
+    """`Listening` as a node of `rosrm.node`."""
+
+
+@pytest.fixture
+def hearer(implementation):
+    """Return the class of a listener, of each implementation of the handoff protocol."""
+    return type("Listener", (Listening, implementation), {})
 
 
 class Threads:
@@ -109,9 +132,9 @@ class Talker:
 # --- one thread -------------------------------------------------------------------------------
 
 
-def test_a_silent_source_buffers_all_inputs(stage):
+def test_a_silent_source_buffers_all_inputs(stage, hearer):
     """A source buffers all inputs while its destination exhausts timeouts and grace periods."""
-    pair = pair_of(stage, Listener)
+    pair = pair_of(stage, hearer)
     talker = Talker(stage, 0.0, readers=2)
     pair.conductor.silence(pair.second)
     for number in range(3000):
@@ -123,10 +146,10 @@ def test_a_silent_source_buffers_all_inputs(stage):
 
 
 @pytest.mark.parametrize("end", ["resumed", "taken over"])
-def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
+def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end, hearer):
     """The author's exception is raised from the executor's spin, as in rclpy."""
 
-    class Picky(Listener):
+    class Picky(hearer):
         def take(self, message):
             if message.data == 1:
                 raise ValueError("bad input")
@@ -142,7 +165,7 @@ def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
         stage.remove(pair.first)
         successor = pair.second
     talker.say(0, 1, 2, 3)
-    stage.spin_until(lambda: len(successor._rosrm.entities.buffer) == 4, "four that are kept")
+    stage.spin_until(lambda: buffered(successor) == 4, "four that are kept")
 
     def go_on():
         if end == "resumed":
@@ -161,10 +184,10 @@ def test_an_input_whose_callback_raises_costs_that_input_alone(stage, end):
     assert successor.seen == [0, 2, 3]
 
 
-def test_timers_and_services_run_despite_overload(stage):
+def test_timers_and_services_run_despite_overload(stage, implementation):
     """Timers and services run despite overload, as in a node that was not migrated."""
 
-    class Busy(Listener, Server):
+    class Busy(Listening, Serving, implementation):
         pass
 
     there = Stage(beside=stage)  # with its own participant and thread
@@ -246,15 +269,14 @@ def test_a_source_processes_what_waits_before_it_falls_silent(stage):
     assert pair.first.seen == list(range(50))
 
 
-def test_a_request_during_the_silence_is_answered_once(stage):
+def test_a_request_during_the_silence_is_answered_once(stage, server):
     """A buffered request is answered once, and blocks no thread."""
-    pair = pair_of(stage, Server)
+    pair = pair_of(stage, server)
     client = stage.plain.create_client(Trigger, "/counter/poke")
     stage.spin_until(client.service_is_ready, "the service")
     pair.conductor.silence(pair.second)
     answers = [client.call_async(Trigger.Request()) for _ in range(5)]
-    (held,) = (one for one in pair.first._rosrm.entities._openings if one.srv_name == "~/poke")
-    stage.spin_until(lambda: len(held._held) == 5, "five requests that are held")
+    stage.spin_until(lambda: held_requests(pair.first) == 5, "five requests that are held")
     assert pair.first.served == 0
     pair.conductor.resume()
     stage.spin_until(lambda: all(one.done() for one in answers), "the answers")

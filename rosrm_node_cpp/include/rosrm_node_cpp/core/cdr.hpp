@@ -4,6 +4,7 @@
 /// The core writes and reads it without ROS types, because sealing encrypts exactly these bytes.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <cstring>
 #include <stdexcept>
@@ -149,7 +150,7 @@ public:
     const auto count = number<std::uint32_t>();
     need(count);  // each element has at least a byte
     std::vector<T> values;
-    values.reserve(count);
+    values.reserve(std::min<std::size_t>(count, 1024));  // a forged count allocates no memory
     for (std::uint32_t index = 0; index < count; ++index) {
       values.push_back(read());
     }
