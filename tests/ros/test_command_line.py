@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import getpass
 import json
@@ -18,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from rosrm.cli.ros2_verb import complete
 from rosrm.testing.local_cluster import claim_domain
 from tests.ros.clusters import alive, host, wait_until_none
 from tests.waiting import PATIENCE, quickest, wait_gone, wait_until
@@ -174,6 +176,14 @@ def test_names_complete_in_bash(rosrm, words, name) -> None:
         return done.stdout
 
     wait_until(lambda: name in complete().split(), f"{name} as the completion of {words!r}")
+
+
+def test_names_complete_behind_ros2(rosrm, monkeypatch) -> None:
+    """The same names reach `ros2 rosrm`, whose completion calls the verb."""
+    for name, value in rosrm.environment.items():
+        monkeypatch.setenv(name, value)
+    given = argparse.Namespace(words=["explain"])
+    wait_until(lambda: complete("t", given) == ["talker"], "the completion of `ros2 rosrm explain`")
 
 
 def test_hosts(rosrm) -> None:

@@ -68,6 +68,41 @@ def test_ros2_can_call_the_verb_without_a_base_class():
     assert "ros2cli" not in sys.modules
 
 
+@pytest.fixture
+def completer():
+    """Return the function by which argcomplete completes the words after `ros2 rosrm`."""
+    parser = argparse.ArgumentParser()
+    RosrmVerb().add_arguments(parser, "ros2")
+    (action,) = (one for one in parser._actions if one.dest == "words")
+
+    def call(*words):
+        *before, prefix = words
+        given = argparse.Namespace(words=list(before))
+        return action.completer(prefix=prefix, action=action, parser=parser, parsed_args=given)
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("given", "found"),
+    [
+        (("ad",), ["adopt"]),
+        (("ps", "--all", "--ho"), ["--host"]),
+        (("key", "rev"), ["revoke"]),
+        (("ps", "--zzz"), []),
+        (("run", "it's", "--time"), ["--time-limit"]),
+    ],
+)
+def test_words_after_ros2_rosrm_complete(completer, given, found):
+    """`ros2` completes by argcomplete, which gets the words that `rosrm` offers a shell."""
+    assert completer(*given) == found
+
+
+def test_before_the_first_word_all_commands_are_offered(completer):
+    """Argcomplete has parsed no word then."""
+    assert {"adopt", "ps", "up"} <= set(completer(""))
+
+
 @pytest.mark.skipif(
     importlib.util.find_spec("ros2cli") is None, reason="this machine has no ros2cli"
 )
