@@ -33,7 +33,7 @@ def spawn(tmp_path):
         program.parent.mkdir(parents=True, exist_ok=True)
         program.write_text(PROGRAM)
         words = [sys.executable, "-I", "-S", str(program)]
-        pids.append(os.posix_spawn(sys.executable, words, os.environ))
+        pids.append(os.posix_spawn(sys.executable, words, os.environ, setsid=True))
         return pids[-1]
 
     yield start
