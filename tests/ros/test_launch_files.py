@@ -96,6 +96,27 @@ def test_the_processes_of_each_other_file_run(cluster, name) -> None:
     remove(cluster, target)
 
 
+def test_what_no_host_has_is_the_reason_of_the_failure(cluster, tmp_path) -> None:
+    """A package that is nowhere, and an executable that the host of its process lacks."""
+    model = LaunchModel.model_validate(stored("tools.launch.yaml"))
+    node = model.processes[0]
+    absent = node.model_copy(update={"name": "absent", "package": "nowhere"})
+    wrong = node.model_copy(update={"number": 1, "name": "wrong", "executable": "talkr"})
+    model = model.model_copy(update={"processes": [absent, wrong]})
+    beside = tmp_path / "faulty.rosrm.yaml"
+    beside.write_text("nodes: {tools.wrong: {labels: {required: {has: robot}}}}\n")
+    path = Path("/robot/faulty.launch.yaml")
+    work = completed(translated(model, "faulty"), path, beside)
+    cluster.client.apply([checked_work(work, path, None)])
+    everywhere = cluster.wait_for_event("failed", process="tools.absent").message
+    assert "bare: the ROS package 'nowhere' was not found" in everywhere
+    assert "robot: the ROS package 'nowhere' was not found" in everywhere
+    there = cluster.wait_for_event("failed", process="tools.wrong").message
+    assert "bare lacks the label has=robot" in there
+    assert "robot: the package 'demo_robot' has no executable 'talkr'" in there
+    assert "did you mean talker?" in there
+
+
 def test_the_components_of_a_launch_file_are_loaded_into_their_container(cluster) -> None:
     """The ROS wheels have no components in C++, so rosrm's container takes their place."""
     pytest.importorskip("composition_interfaces")

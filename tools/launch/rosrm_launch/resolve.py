@@ -42,7 +42,7 @@ def main() -> NoReturn:
 def _answer(file: str, given: Sequence[str], *, show_arguments: bool) -> LaunchModel | Failure:
     try:
         from rosrm_launch import visiting  # noqa: PLC0415 - imports launch, which may be missing
-    except ImportError as error:
+    except Exception as error:  # noqa: BLE001 - of an installation that is not whole
         return Failure(
             failure=f"{sys.executable} cannot import `launch` and `launch_ros`: {error}. They come "
             "with a ROS installation: source its setup file, such as /opt/ros/jazzy/setup.bash, "

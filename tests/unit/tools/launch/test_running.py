@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 import tempfile
@@ -158,6 +159,23 @@ def test_without_launch_the_error_says_where_it_comes_from(file):
     said = refusal(file("return L([])"))
     assert f"{sys.executable} cannot import `launch` and `launch_ros`" in said
     assert "/opt/ros/jazzy/setup.bash" in said
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("import time; time.sleep(1000)", "not resolved within 2 s, and was ended"),
+        ("import os; os._exit(4)", "the resolver ended with exit code 4 and without a result"),
+        ("import os; os.kill(os.getpid(), 11)", "the resolver ended by signal 11 and without"),
+        ("raise RuntimeError('half installed')", "cannot import `launch` and `launch_ros`: half"),
+        ("print('{}'); raise ImportError('too old')", "`launch_ros`: too old. They come with"),
+    ],
+)
+def test_a_faulty_installation_of_launch_is_one_error(file, tmp_path, monkeypatch, code, said):
+    """Whatever its import does, the command ends in time, and with the cause."""
+    (tmp_path / "launch.py").write_text(code)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    assert said in refusal(file("return L([])"), timeout=2.0 if "sleep" in code else 30.0)
 
 
 def test_a_launch_file_is_found_in_its_package(tmp_path, monkeypatch):
