@@ -15,6 +15,7 @@ from rosrm.model.parameters import SECTION, merged_parameters
 from rosrm.model.values import KEEP_NAME, ParameterSource, qualified_name
 from rosrm.wording import listed
 from rosrm_launch.model import Component, LaunchModel, Load, Omission, Process
+from rosrm_launch.package_paths import PackagePaths
 
 #: Restarts of a process that launch starts again without end.
 _ENDLESS: Final = 2**31 - 1
@@ -61,7 +62,7 @@ class _Translator:
     def __init__(self, model: LaunchModel, application: str) -> None:
         self._model = model
         self._application = application
-        self._paths = _Packages(model.packages)
+        self._paths = PackagePaths(model.packages)
         self._omissions = list(model.omissions)
         self._notes = list(model.notes)
         self._started = self._without_endless_waits(model.processes)
@@ -256,37 +257,6 @@ class _Translator:
                 f"{one.file}: {_title(one)} names {listed(outside)}, which must exist on each host "
                 "that may run it"
             )
-
-
-class _Packages:
-    """Paths below the directories of packages, written so that each host finds them."""
-
-    def __init__(self, prefixes: Mapping[str, str]) -> None:
-        self._prefixes = prefixes
-        roots = "|".join(sorted(map(re.escape, set(prefixes.values())), key=len, reverse=True))
-        self._path = re.compile(rf"({roots})/(share|lib)/([A-Za-z0-9_]+)(?![\w.-])")
-
-    def in_texts(self, value: Any) -> Any:
-        """Return a value whose texts name packages instead of their directories here."""
-        if isinstance(value, str):
-            return self._path.sub(self._reference, value) if self._prefixes else value
-        if isinstance(value, list):
-            return [self.in_texts(one) for one in value]
-        if isinstance(value, Mapping):
-            return {key: self.in_texts(one) for key, one in value.items()}
-        return value
-
-    def has(self, path: str) -> bool:
-        """Return True for a path below the directory of a package."""
-        return bool(self.in_texts(path) != path)
-
-    def _reference(self, found: re.Match[str]) -> str:
-        prefix, folder, package = found.groups()
-        if self._prefixes.get(package) != prefix:
-            return found[0]
-        if folder == "share":
-            return f"$(find-pkg-share {package})"
-        return f"$(find-pkg-prefix {package})/lib/{package}"
 
 
 def _node_of(one: Process) -> str:

@@ -133,6 +133,18 @@ def test_a_temporary_file_of_the_launch_file_is_listed(file):
 
 
 @needs_launch
+def test_a_process_of_two_events_starts_after_the_first(file):
+    """An action that is executed twice is an error in launch."""
+    body = "from launch.event_handlers import OnProcessExit as Exit\n"
+    body += "a, b, c = [ExecuteProcess(cmd=[name]) for name in 'abc']\n"
+    body += "return L([a, b, *(RegisterEventHandler(Exit(target_action=one, on_exit=c))\n"
+    body += "  for one in (a, b))])"
+    model = resolve(file(body), [], timeout=30.0)
+    assert [one.command for one in model.processes] == [["a"], ["b"], ["c"]]
+    assert [one.action for one in model.omissions] == ["second start of c"]
+
+
+@needs_launch
 def test_a_scope_ends_with_its_group(file, monkeypatch):
     """A variable that has the same value in the shell is set only where the file sets it."""
     monkeypatch.setenv("SIDE", "left")

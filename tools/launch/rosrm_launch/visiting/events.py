@@ -91,7 +91,7 @@ def follow(
         return
 
     def trigger() -> Trigger | None:
-        number = visit.numbers.get(id(target))
+        number = visit.numbers.get(target)
         return None if number is None else Trigger((Wait(process=number, event=event),))
 
     visit.defer(list(entities) if isinstance(entities, (list, tuple)) else [entities], trigger)

@@ -79,6 +79,9 @@ def _prefix_length(action: Any) -> int:
 
 def _add(visit: Visit, action: Any, **fields: Any) -> None:
     """Record the process of a prepared action, and what follows its end."""
+    if action in visit.numbers:
+        visit.omit(action, "launch starts it only once", f"second start of {program_of(action)}")
+        return
     described = action.process_description
     number = len(visit.processes)
     process = Process(
@@ -97,7 +100,7 @@ def _add(visit: Visit, action: Any, **fields: Any) -> None:
     )  # fmt: skip
     paths = _without_temporary(visit, action, existing_paths(process))
     visit.processes.append(process.model_copy(update={"paths": paths}))
-    visit.numbers[id(action)] = number
+    visit.numbers[action] = number
     if action.emulate_tty:
         visit.note("emulate_tty: processes have no terminal; `rosrm logs` shows their output")
     on_exit = hidden(action, ExecuteLocal, "on_exit")

@@ -48,7 +48,7 @@ class Visit:
         set_variables: variables of the environment that the file sets, also to the same value;
             `outer_variables`: those of the groups around.
         asked: names of the launch configurations that were asked for.
-        numbers: of the processes, by the identity of their actions.
+        numbers: of the processes, by their actions.
     """
 
     def __init__(self, file: str, arguments: Mapping[str, str]) -> None:
@@ -66,7 +66,7 @@ class Visit:
         self.deferred: deque[Deferred] = deque()
         self.arguments: dict[str, Argument] = {}
         self.processes: list[Process] = []
-        self.numbers: dict[int, int] = {}
+        self.numbers: dict[Any, int] = {}
         self.lifecycle_nodes: list[Any] = []
         self.loads: list[Load] = []
         self.transitions: list[Transition] = []
