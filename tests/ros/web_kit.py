@@ -67,7 +67,7 @@ class Gateway:
     def _url(self) -> str:
         lines = [line for line in self.said if line.startswith("rosrm web: ")]
         assert self.process.poll() is None, self.said
-        return lines[0].split()[2].partition("/v1")[0] if lines else ""
+        return lines[0].split()[2].rstrip(";") if lines else ""
 
     @property
     def address(self) -> tuple[str, int]:

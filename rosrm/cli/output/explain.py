@@ -35,7 +35,7 @@ def render(explanation: Mapping[str, Any]) -> RenderableType:
 
 
 def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
-    yield _headline(explanation)
+    yield headline(explanation)
     if explanation.get("flows"):
         yield _flows(explanation["flows"], explanation.get("flows_omitted", 0))
     if explanation.get("kept"):
@@ -47,8 +47,8 @@ def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
     decision = explanation.get("decision")
     if decision:
         yield Text()
-        yield _sentence(explanation["process"], decision)
-        yield _needs(decision.get("need") or {})
+        yield sentence(explanation["process"], decision)
+        yield needs(decision.get("need") or {})
         if decision.get("hosts"):
             yield _hosts(decision)
         for reason, count in (decision.get("omitted") or {}).items():
@@ -67,7 +67,8 @@ def _parts(explanation: Mapping[str, Any]) -> Iterator[RenderableType]:
         yield tables.entry(f"{ago:>14}", entry["kind"], entry["message"])
 
 
-def _headline(explanation: Mapping[str, Any]) -> Text:
+def headline(explanation: Mapping[str, Any]) -> Text:
+    """Return state, host, reason and owner of a process."""
     text = tables.sentence(explanation["process"], explanation["state"])
     if explanation.get("host"):
         text.append(f" on {explanation['host']}")
@@ -143,14 +144,16 @@ def _limits(limits: Mapping[str, Mapping[str, Any]]) -> Text:
     return Text(f"Limits and scheduling: {values}. ").append(f"Not enforced: {reasons}.", "yellow")
 
 
-def _sentence(name: str, decision: Mapping[str, Any]) -> Text:
+def sentence(name: str, decision: Mapping[str, Any]) -> Text:
+    """Return the decision of the master about a process."""
     ago = f" {duration(decision['elapsed'])} ago" if decision.get("elapsed") else ""
     form = _DECIDED.get(decision["kind"], "{process}: " + words(decision["kind"]))
     what = form.format(process=name, host=decision.get("chosen"), ago=ago)
     return Text(f"{what}. Scoring policy: {decision['policy'] or 'none'}; the lowest score wins.")
 
 
-def _needs(need: Mapping[str, float]) -> Text:
+def needs(need: Mapping[str, float]) -> Text:
+    """Return the amounts of resources that a process needs."""
     amounts = [f"{name} {amount(value, _UNITS.get(name, ''))}" for name, value in need.items()]
     return Text(f"Needs, declared or estimated: {', '.join(amounts) or 'none'}.")
 
@@ -165,13 +168,18 @@ def _defaults(defaults: Mapping[str, Any]) -> Text:
 
 def _hosts(decision: Mapping[str, Any]) -> RenderableType:
     made = tables.table("HOST", "", "SCORE", "WHY", right=("SCORE",))
-    for host in decision["hosts"]:
-        score = host.get("score")
-        verdict = host["verdict"] if decision["kind"] != "fits" else "fits"
-        made.add_row(
-            Text(host["name"]),
-            Text(verdict, _STYLES.get(verdict, "")),
-            "" if score is None else f"{round(score, _DECIMALS) + 0.0:.4g}",
-            Text(host.get("reason") or ""),
-        )
+    for name, verdict, score, reason in host_cells(decision):
+        made.add_row(Text(name), Text(verdict, _STYLES.get(verdict, "")), score, Text(reason))
     return made
+
+
+def host_cells(decision: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield name, verdict, score and reason of each host of a decision."""
+    for host in decision.get("hosts") or ():
+        score = host.get("score")
+        yield (
+            host["name"],
+            host["verdict"] if decision["kind"] != "fits" else "fits",
+            "" if score is None else f"{round(score, _DECIMALS) + 0.0:.4g}",
+            host.get("reason") or "",
+        )

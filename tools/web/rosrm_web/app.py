@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from fastapi import FastAPI
+from fastapi import FastAPI, HTTPException
 
 from rosrm.model.applications import ApplicationRow, ApplyResult
 from rosrm.model.rows import EventRow, ProcessRow
@@ -14,10 +14,14 @@ from rosrm_web import problems
 from rosrm_web.acting import WORK_TYPES, Acting, Message
 from rosrm_web.changes import Changes
 from rosrm_web.metrics.endpoint import Metrics
+from rosrm_web.page.login import Login
+from rosrm_web.page.site import mount
 from rosrm_web.reading import Host, Log, Reading, Status
+from rosrm_web.tokens import LOGIN
 
 if TYPE_CHECKING:
     from rosrm_web.gateway import Gateway
+    from rosrm_web.settings import Settings
 
 
 #: Body of a request with a work file, in OpenAPI.
@@ -68,7 +72,7 @@ def routes(gateway: Gateway) -> list[Route]:
     ]
 
 
-def create_app(gateway: Gateway) -> FastAPI:
+def create_app(gateway: Gateway, settings: Settings) -> FastAPI:
     """Return the application; `guard.Guard` has to stand before it."""
     app = FastAPI(
         title="rosrm", version=__version__, openapi_url="/v1/openapi.json",
@@ -82,5 +86,14 @@ def create_app(gateway: Gateway) -> FastAPI:
         )
     for kind, handler in problems.HANDLERS.items():
         app.add_exception_handler(kind, handler)
-    # The page is mounted here, below the same guard, with `gateway` as its source.
+    login = Login(settings)
+    app.add_api_route(LOGIN, login.show, methods=["GET"], include_in_schema=False)
+    app.add_api_route(LOGIN, login.enter, methods=["POST"], include_in_schema=False)
+    app.add_api_route("/v1/{path:path}", _unknown_path, include_in_schema=False)
+    mount(app, gateway)  # takes all other paths
     return app
+
+
+async def _unknown_path() -> None:
+    """Answer programs with an error, not with a page for people."""
+    raise HTTPException(404)

@@ -64,7 +64,7 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     ] = None,
     domain: Domain = None,
 ) -> None:
-    """Serve the state of the cluster over HTTP until Ctrl-C.
+    """Serve a page about the cluster, and its state as JSON, until Ctrl-C.
 
     The gateway is a client of the master, on 127.0.0.1:8290, and by default only reads.
     """
@@ -80,7 +80,7 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     gateway = Gateway(partial(_connect, ros_settings(ctx, domain), cluster))
     with open_socket(settings) as listener:
         rights = "operators may act" if settings.is_acting else "it only reads"
-        said = f"rosrm web: {url_of(listener, settings)}/v1/status; {rights}"
+        said = f"rosrm web: {url_of(listener, settings)}; {rights}"
         serve(gateway, settings, listener, lambda: echo(said))
 
 

@@ -6,12 +6,13 @@ import asyncio
 import ipaddress
 import logging
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
+from http.cookies import SimpleCookie
 from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm_web import problems
 from rosrm_web.settings import Settings
-from rosrm_web.tokens import ANYONE, User, user_of
+from rosrm_web.tokens import ANYONE, COOKIE, LOGIN, User, user_of
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -35,10 +36,18 @@ _HEADERS: Final = {
     b"cross-origin-opener-policy": b"same-origin",
     b"cross-origin-resource-policy": b"same-origin",
     b"permissions-policy": b"camera=(), geolocation=(), microphone=()",
-    b"referrer-policy": b"no-referrer",
+    b"referrer-policy": b"same-origin",
     b"x-content-type-options": b"nosniff",
     b"x-frame-options": b"DENY",
 }
+#: Policy for the page and its files: nothing from outside. NiceGUI compiles templates there.
+_PAGE_POLICY: Final = (
+    b"default-src 'self'; script-src 'self' 'unsafe-inline' 'unsafe-eval'; "
+    b"style-src 'self' 'unsafe-inline'; img-src 'self' data:; font-src 'self' data:; "
+    b"connect-src 'self'; frame-ancestors 'none'; form-action 'self'; base-uri 'self'"
+)
+#: Paths that are no page.
+_FOR_PROGRAMS: Final = ("/v1/", "/metrics")
 _WITH_TLS: Final = {b"strict-transport-security": b"max-age=31536000"}
 
 
@@ -75,6 +84,7 @@ class Guard:
         if scope["type"] == "lifespan":
             await self._app(scope, receive, send)
             return
+        is_page = not scope["path"].startswith(_FOR_PROGRAMS)
         try:
             headers = single_headers(scope["headers"])
             check_host(headers, self._settings.host_names)
@@ -86,14 +96,20 @@ class Guard:
             await _reject(error, scope, receive, self._hardened(send))
             return
         scope["user"] = user
+        scope["may_act"] = self._settings.is_acting and user.role == "operator"
         acts = scope.get("method", "GET") not in _SAFE
         note = f"{user.name}: {scope['method']} {scope['path']!r:.100}" if acts else ""
-        await self._app(scope, receive, self._hardened(send, note))
+        await self._app(scope, receive, self._hardened(send, note, is_page=is_page))
 
     def user_of_request(self, scope: Scope, headers: Mapping[str, str]) -> User:
         """Return the user of a request; refuse it if the user may not send it."""
+        if scope["path"] == LOGIN:
+            return ANYONE
         users = self._settings.users
-        user = user_of(headers.get("authorization", ""), users) if users else ANYONE
+        given = headers.get("authorization") or _of_cookie(headers)
+        user = user_of(given, users) if users else ANYONE
+        if user is None and scope["path"] == "/":
+            raise Rejected(303, "a token is required", {"location": LOGIN})
         if user is None:
             raise Rejected(
                 401, "the token is missing or wrong: `Authorization: Bearer TOKEN` is required",
@@ -109,11 +125,14 @@ class Guard:
             raise Rejected(403, f"{user.name} is a {user.role}: only operators may act")
         return user
 
-    def _hardened(self, send: Send, note: str = "") -> Send:
+    def _hardened(self, send: Send, note: str = "", *, is_page: bool = False) -> Send:
         """Return `send` with the headers of every answer; an application may set its own.
 
         With a note, the status of the answer is logged after it.
         """
+        headers = self._headers
+        if is_page:
+            headers = {**headers, b"content-security-policy": _PAGE_POLICY}
 
         async def send_hardened(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -121,11 +140,17 @@ class Guard:
                     _log.info("%s: %d", note, message["status"])
                 given = list(message.get("headers", ()))
                 names = {name.lower() for name, _ in given}
-                ours = [one for one in self._headers.items() if one[0] not in names]
+                ours = [one for one in headers.items() if one[0] not in names]
                 message = {**message, "headers": [*given, *ours]}
             await send(message)
 
         return send_hardened
+
+
+def _of_cookie(headers: Mapping[str, str]) -> str:
+    """Return the token of the cookie as the value of an Authorization header; "": none."""
+    token = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    return "" if token is None else f"Bearer {token.value}"
 
 
 def single_headers(headers: list[tuple[bytes, bytes]]) -> Mapping[str, str]:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 MOST_CONNECTIONS: Final = 128
 #: Bytes of the request line and the headers.
 _LARGEST_HEAD: Final = 16 * 1024
+#: Bytes of a message of the page in the browser.
+_LARGEST_MESSAGE: Final = 256 * 1024
 #: Milliseconds after which the kernel ends a connection whose client takes no data.
 _SLOWEST_READER: Final = 20_000
 
@@ -73,10 +75,10 @@ def serve(
         ready: called once when the gateway answers requests.
     """
     config = uvicorn.Config(
-        Guard(create_app(gateway), settings), loop="asyncio", http="h11", lifespan="off",
+        Guard(create_app(gateway, settings), settings), loop="asyncio", http="h11", lifespan="on",
         log_config=None, access_log=False, server_header=False, proxy_headers=False,
         limit_concurrency=MOST_CONNECTIONS, h11_max_incomplete_event_size=_LARGEST_HEAD,
-        timeout_graceful_shutdown=1,
+        timeout_graceful_shutdown=1, ws_max_size=_LARGEST_MESSAGE,
         ssl_certfile=settings.certificate, ssl_keyfile=settings.key,
     )  # fmt: skip
     asyncio.run(_serve(gateway, uvicorn.Server(config), listener, ready))

@@ -16,6 +16,11 @@ from rosrm_web.private_files import check_private
 #: A viewer reads; an operator acts, too.
 Role = Literal["viewer", "operator"]
 
+#: Name of the cookie with the token, which the form of the page sets.
+COOKIE: Final = "rosrm_token"
+#: Path of that form, which needs no token.
+LOGIN: Final = "/login"
+
 _ROLES: Final = get_args(Role)
 _NAME: Final = re.compile(r"[A-Za-z0-9_.@-]{1,64}")
 #: Characters that RFC 6750 allows; 24 of them cannot be guessed if they are random.

@@ -165,3 +165,24 @@ def test_every_answer_has_the_headers_of_a_strict_page():
         b"default-src 'self'"
     ]
     assert dict(own)[b"x-content-type-options"] == b"nosniff"
+
+
+def test_the_cookie_of_the_form_is_a_token():
+    """Browsers send no Authorization header for a page."""
+    cookie = f"other=1; rosrm_token={TOKEN}"
+
+    assert request(scope(host="localhost", authorization="", cookie=cookie))["status"] == 204
+    assert (
+        request(scope(host="localhost", authorization="", cookie="rosrm_token=no"))["status"] == 303
+    )
+
+
+def test_a_browser_without_a_token_is_led_to_the_form():
+    """Programs get 401 for all other paths."""
+    answer = request(scope(host="localhost", authorization=""))
+
+    assert (answer["status"], dict(answer["headers"])[b"location"]) == (303, b"/login")
+    assert (
+        request({**scope(host="localhost", authorization=""), "path": "/v1/hosts"})["status"] == 401
+    )
+    assert request({**scope(host="localhost", authorization=""), "path": "/login"})["status"] == 204

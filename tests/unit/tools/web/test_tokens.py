@@ -102,7 +102,7 @@ def ask(write, method, token, *, acting=True):
     """Return the user of a request, as far as tokens and rights are concerned."""
     guard = Guard(None, Settings(users=read_tokens(write()), is_acting=acting))
     headers = {"authorization": f"Bearer {token}"} if token else {}
-    return guard.user_of_request({"type": "http", "method": method}, headers)
+    return guard.user_of_request({"type": "http", "method": method, "path": "/v1/hosts"}, headers)
 
 
 @pytest.mark.parametrize(
@@ -137,9 +137,12 @@ def test_without_tokens_everyone_reads_and_nobody_acts():
     """The default on this machine."""
     guard = Guard(None, Settings())
 
-    assert guard.user_of_request({"type": "http", "method": "GET"}, {}).role == "viewer"
+    assert (
+        guard.user_of_request({"type": "http", "method": "GET", "path": "/v1/hosts"}, {}).role
+        == "viewer"
+    )
     with pytest.raises(Rejected, match="only reads"):
-        guard.user_of_request({"type": "http", "method": "POST"}, {})
+        guard.user_of_request({"type": "http", "method": "POST", "path": "/v1/drain"}, {})
 
 
 def test_other_machines_need_tokens(write):

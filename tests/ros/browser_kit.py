@@ -1,0 +1,54 @@
+"""A real browser for tests of the page: Chromium of the system, driven by Playwright."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from tests.waiting import PATIENCE
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+
+
+@contextmanager
+def browser() -> Iterator[Any]:
+    """Yield a browser; skip the tests where there is none."""
+    if CHROMIUM is None:
+        pytest.skip("this machine has no Chromium: apt-get install chromium")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        # Its sandbox needs a user that is not root.
+        one = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        try:
+            yield one
+        finally:
+            one.close()
+
+
+@contextmanager
+def tab(browser: Any, url: str, **options: Any) -> Iterator[Any]:
+    """Yield a tab with a page; fail if the page reports an error or asks another machine."""
+    context = browser.new_context(**options)
+    context.set_default_timeout(PATIENCE * 1000)
+    page = context.new_page()
+    errors: list[str] = []
+    outside: list[str] = []
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("request", lambda asked: outside.append(asked.url) if _is_outside(asked.url) else None)
+    try:
+        page.goto(url)
+        yield page
+        assert outside == []
+        assert errors == []
+    finally:
+        context.close()
+
+
+def _is_outside(url: str) -> bool:
+    return not url.startswith(("http://127.0.0.1:", "ws://127.0.0.1:", "data:", "blob:"))

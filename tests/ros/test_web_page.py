@@ -1,0 +1,173 @@
+"""The page of `rosrm web` in a real browser, against a real cluster."""
+
+from __future__ import annotations
+
+import signal
+import time
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from tests.ros.browser_kit import browser, tab
+from tests.ros.clusters import STEADY, Cluster, host, job, service
+from tests.ros.web_kit import Gateway, gateway
+
+#: HTML in a log line and in a reason.
+HTML = "<img src=x onerror=alert(1)>"
+TOKEN = "0123456789abcdef01234567"
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with browser() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared) -> Cluster:
+    """Return a cluster with a process that writes, one that failed, and one that waits."""
+    made = make_shared(host("robot-1"), host("robot-2"), liveness=STEADY)
+    made.submit(
+        service("talker", "sh", "-c", f"echo '{HTML}'; while sleep 0.2; do echo beat; done"),
+        job("loser", "sh", "-c", "exit 4"),
+        service("giant", "sleep", "9", needs={"memory": 1e15}),
+    )
+    made.wait("talker", "running")
+    made.ended("loser")
+    made.wait("giant", "set_aside")
+    return made
+
+
+@pytest.fixture(scope="module")
+def web(cluster):
+    with gateway(cluster.ros) as one:
+        yield one
+
+
+@pytest.fixture
+def page(chromium, web: Gateway):
+    with tab(chromium, web.url) as one:
+        row(one, "robot-1").wait_for()
+        yield one
+
+
+def row(page: Any, name: str) -> Any:
+    """Return the row of a host or process in the visible table."""
+    return page.locator(".ag-row:visible", has_text=name).first
+
+
+def open_tab(page: Any, name: str) -> None:
+    page.get_by_role("tab", name=name).click()
+
+
+def test_hosts_and_processes_are_in_tables(page):
+    """Hosts with their usage, processes with state and reason, and events."""
+    assert "up" in row(page, "robot-2").inner_text()
+
+    open_tab(page, "Processes")
+    row(page, "talker").wait_for()
+    assert "failed" in row(page, "loser").inner_text()
+    assert "exit code 4" in row(page, "loser").inner_text()
+
+    open_tab(page, "Events")
+    row(page, "loser failed").wait_for()
+
+
+def test_the_strip_shows_what_is_wrong_and_filters(page):
+    """Its buttons lead to the processes in this state, and back to all."""
+    page.get_by_role("button", name="1 process failed").click()
+    row(page, "loser").wait_for()
+    page.locator(".ag-row:visible", has_text="talker").wait_for(state="hidden")
+
+    page.get_by_role("button", name="Show all").click()
+    row(page, "talker").wait_for()
+
+
+def test_a_process_opens_with_its_scores_and_its_log(page):
+    """HTML in the log stays text, new lines appear, and a search leaves only some."""
+    open_tab(page, "Processes")
+    row(page, "talker").dblclick()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_text("Scores of the hosts").wait_for()
+    dialog.get_by_role("cell", name="chosen").wait_for()
+
+    open_tab(dialog, "Logs")
+    dialog.get_by_text(HTML).wait_for()
+    beats = dialog.get_by_text("beat").count()
+    dialog.get_by_text("beat").nth(beats + 2).wait_for()
+    dialog.get_by_label("Show only lines with").fill("onerror")
+    dialog.get_by_text("beat").first.wait_for(state="detached")
+    assert dialog.get_by_text(HTML).count() == 1
+
+
+def test_a_change_appears_without_a_reload(page, cluster):
+    """A new process is in the table, and a cancelled one changes its state."""
+    open_tab(page, "Processes")
+    cluster.submit(service("late", "sleep", "1000"))
+    row(page, "late").wait_for()
+    cluster.cancel("late")
+    page.locator(".ag-row:visible", has_text="late").filter(has_text="cancelled").wait_for()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_serious_finding_of_an_accessibility_checker(chromium, web, scheme):
+    """Names, roles and contrasts of the page, by axe-core."""
+    with tab(chromium, web.url, color_scheme=scheme) as page:
+        row(page, "robot-1").wait_for()
+        found = Axe().run(page).response["violations"]
+
+    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    assert [(one["id"], one["nodes"][0]["html"][:200]) for one in serious] == []
+
+
+def test_the_page_fits_a_phone(chromium, web):
+    """Only tables scroll sideways."""
+    with tab(chromium, web.url, viewport={"width": 390, "height": 844}) as page:
+        row(page, "robot-1").wait_for()
+        wide = page.evaluate("document.documentElement.scrollWidth")
+
+    assert wide <= 390
+
+
+def test_a_token_opens_the_page_and_an_operator_acts(chromium, cluster, tmp_path):
+    """Without a token there is only the form; each action asks once, and says what it will do."""
+    tokens = tmp_path / "tokens"
+    tokens.write_text(f"operator ada {TOKEN}\n")
+    tokens.chmod(0o600)
+    with (
+        gateway(cluster.ros, "--tokens", str(tokens), "--allow-actions") as web,
+        tab(chromium, web.url) as page,
+    ):
+        page.get_by_label("Token").fill(TOKEN)
+        page.get_by_role("button", name="Log in").click()
+        row(page, "robot-2").dblclick()
+        page.get_by_role("button", name="Cordon", exact=True).click()
+        page.get_by_text("robot-2 gets no new processes.").wait_for()
+        page.get_by_role("button", name="Cordon", exact=True).last.click()
+        page.locator(".ag-row", has_text="cordoned").wait_for()
+        page.get_by_role("button", name="Uncordon").click()
+        page.get_by_role("button", name="Uncordon").last.click()
+        page.locator(".ag-row", has_text="cordoned").wait_for(state="detached")
+
+
+def test_a_reader_has_no_buttons(page):
+    """A gateway that only reads offers no action."""
+    open_tab(page, "Processes")
+    row(page, "talker").dblclick()
+    page.get_by_role("dialog").get_by_role("button", name="Close").wait_for()
+    assert page.get_by_role("button", name="Cancel").count() == 0
+
+
+def test_a_lost_master_is_shown_and_comes_back(chromium, make_cluster):
+    """The header says so within 3 s; nothing has to be loaded again."""
+    cluster = make_cluster(host("a"), liveness=STEADY)
+    with gateway(cluster.ros) as web, tab(chromium, web.url) as page:
+        page.get_by_text("master: up").wait_for()
+        cluster.end(cluster.master, signal.SIGKILL)
+        killed = time.monotonic()
+        page.get_by_text("has not answered").wait_for()
+        assert time.monotonic() - killed < 10.0  # 3 s on a quiet machine
+        cluster.reconnect()
+        cluster.start_master()
+        page.get_by_text("master: up").wait_for()

@@ -1,0 +1,234 @@
+"""Dialogs of the page: a process with its explanation and logs, a host, and what may be done."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Final
+
+from nicegui import background_tasks, ui
+
+from rosrm.cli.output import explain
+from rosrm.client.logs import LogSelection
+from rosrm.errors import RosrmError
+from rosrm.wording import duration
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.client.logs import LogReader
+    from rosrm_web.gateway import Gateway
+
+#: Last lines of a log that are shown.
+_LINES: Final = 1000
+#: Seconds between two requests for new output.
+_PERIOD: Final = 1.0
+_SCORES: Final = ("host", "verdict", "score", "why")
+
+
+@dataclass(frozen=True)
+class Action:
+    """Something that an operator may do.
+
+    Attributes:
+        title: text of the button.
+        warning: what it will do; asked before it is done.
+        request: to the master, with the name of the process or host; returns its message.
+    """
+
+    title: str
+    warning: str
+    request: Callable[[Client, str], str]
+
+
+OF_PROCESS: Final = (
+    Action("Restart", "{name} is stopped and started again.", lambda c, name: c.restart([name])),
+    Action("Move", "{name} moves to another host.", lambda c, name: c.migrate(name)),
+    Action("Cancel", "{name} is stopped for good.", lambda c, name: c.cancel([name])),
+)
+OF_HOST: Final = (
+    Action("Cordon", "{name} gets no new processes.", lambda c, name: c.cordon(name)),
+    Action("Uncordon", "{name} gets new processes again.", lambda c, name: c.uncordon(name)),
+    Action(
+        "Drain", "{name} gets no new processes, and those that can leave it move away.",
+        lambda c, name: c.drain(name),
+    ),
+)  # fmt: skip
+
+
+class Dialog:
+    """A dialog about one process or host, with buttons for operators.
+
+    Args:
+        gateway: sends the requests.
+        actions: buttons; (): the user may not act.
+        on_action: called after an action.
+    """
+
+    def __init__(
+        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[], None]
+    ) -> None:
+        self._gateway, self._on_action = gateway, on_action
+        self.name = ""
+        with ui.dialog() as self.dialog:
+            self.card = ui.card().classes("w-full max-w-screen-lg")
+        with self.card, ui.row().classes("w-full items-center"):
+            self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+            ui.space()
+            for action in actions:
+                ui.button(action.title, on_click=partial(self._confirm, action)).props(
+                    "outline no-caps"
+                )
+            ui.button("Close", on_click=self.dialog.close).props("flat no-caps")
+
+    def open(self, name: str) -> None:
+        """Show the process or host of this name."""
+        self.name = self._title.text = name
+        self.dialog.open()
+
+    async def _confirm(self, action: Action) -> None:
+        name = self.name
+        with ui.dialog() as question, ui.card():
+            ui.label(action.warning.format(name=name))
+            with ui.row():
+                ui.button(action.title, on_click=lambda: question.submit(True)).props("no-caps")
+                ui.button("Do nothing", on_click=question.close).props("flat no-caps")
+        if await question:
+            try:
+                message = await self._gateway.ask(
+                    self._gateway.acting, lambda client: action.request(client, name)
+                )
+                ui.notify(message)
+            except RosrmError as error:
+                ui.notify(str(error), type="negative", multi_line=True, close_button="Close")
+            self._on_action()
+
+
+class ProcessDialog(Dialog):
+    """The explanation and the logs of a process."""
+
+    def __init__(
+        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[], None]
+    ) -> None:
+        super().__init__(gateway, actions, on_action)
+        with self.card:
+            with ui.tabs() as tabs:
+                ui.tab("why", "Why here").props("no-caps")
+                ui.tab("logs", "Logs").props("no-caps")
+            with ui.tab_panels(tabs, value="why", animated=False).classes("w-full"):
+                with ui.tab_panel("why"):
+                    self._why = ui.column().classes("w-full")
+                with ui.tab_panel("logs"):
+                    self._log = _Log(gateway)
+        self.dialog.on("hide", self._log.stop)
+
+    def open(self, name: str) -> None:
+        """Show the process of this name."""
+        super().open(name)
+        self._why.clear()
+        self._log.start(name)
+        background_tasks.create(self._explain(name))
+
+    async def _explain(self, name: str) -> None:
+        gateway = self._gateway
+        try:
+            found = await gateway.ask(gateway.acting, lambda client: client.explain(name))
+        except RosrmError as error:
+            with self._why:
+                ui.label(str(error)).classes("rosrm-bad")
+            return
+        with self._why:
+            _show_explanation(found)
+
+
+def _show_explanation(explanation: Mapping[str, Any]) -> None:
+    """Show state, decision, the table of scores, and the history of a process."""
+    ui.label(explain.headline(explanation).plain).classes("whitespace-pre-line")
+    decision = explanation.get("decision")
+    if decision:
+        ui.label(explain.sentence(explanation["process"], decision).plain)
+        ui.label(explain.needs(decision.get("need") or {}).plain)
+        cells = [dict(zip(_SCORES, one, strict=True)) for one in explain.host_cells(decision)]
+        _table(_SCORES, cells, "Scores of the hosts, the lowest wins")
+    history = [
+        {"ago": duration(one["elapsed"]), "kind": one["kind"], "message": one["message"]}
+        for one in explanation.get("history") or ()
+    ]
+    _table(("ago", "kind", "message"), history, "History")
+
+
+def _table(names: Sequence[str], cells: list[dict[str, str]], title: str) -> None:
+    columns = [
+        {"name": name, "label": name.capitalize(), "field": name, "align": "left"} for name in names
+    ]
+    rows = [{**row, "id": str(number)} for number, row in enumerate(cells)]
+    table = ui.table(columns=columns, rows=rows, row_key="id", title=title)
+    table.classes("w-full").props("dense flat wrap-cells")
+
+
+class _Log:
+    """The output of a process, live, with a search."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        self._gateway = gateway
+        self._lines: deque[str] = deque(maxlen=_LINES)
+        self._reader: LogReader | None = None
+        self._search = ui.input("Show only lines with", on_change=self._show).props(
+            "dense clearable"
+        )
+        self._text = ui.log(max_lines=_LINES).classes("w-full h-96")
+        self._timer = ui.timer(_PERIOD, self._poll, active=False)
+
+    def start(self, process: str) -> None:
+        """Show the output of a process from now on."""
+        self._lines.clear()
+        self._text.clear()
+        background_tasks.create(self._begin(process))
+
+    def stop(self) -> None:
+        """Read no more output."""
+        self._timer.deactivate()
+
+    async def _begin(self, process: str) -> None:
+        try:
+            self._reader, content = await self._gateway.ask(
+                self._gateway.logs, partial(_open_log, process=process)
+            )
+        except RosrmError as error:
+            self._add(str(error))
+            return
+        self._add(content)
+        self._timer.activate()
+
+    async def _poll(self) -> None:
+        reader = self._reader
+        if reader is None or reader.at_end:
+            return
+        try:
+            chunk = await self._gateway.ask(self._gateway.logs, lambda _: reader.poll())
+        except RosrmError:
+            return  # the header says that the master is lost; the next request may succeed
+        if chunk is not None and chunk.content:
+            self._add(chunk.content.decode(errors="replace"))
+
+    def _add(self, text: str) -> None:
+        lines = text.splitlines()
+        self._lines.extend(lines)
+        for line in self._matching(lines):
+            self._text.push(line)
+
+    def _show(self) -> None:
+        self._text.clear()
+        for line in self._matching(self._lines):
+            self._text.push(line)
+
+    def _matching(self, lines: Sequence[str] | deque[str]) -> list[str]:
+        wanted = self._search.value or ""
+        return [line for line in lines if wanted in line]
+
+
+def _open_log(client: Client, process: str) -> tuple[LogReader, str]:
+    (reader,) = client.log_readers([process], LogSelection(_LINES, follow=True))
+    text = b"".join(chunk.content for chunk in reader.read())
+    return reader, text.decode(errors="replace")

@@ -1,0 +1,90 @@
+"""Regular listings of the cluster, while somebody looks at the page."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Final
+
+from rosrm.errors import RosrmError
+from rosrm_web.watching import give_up_early
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.model.rows import EventRow, Listing
+    from rosrm_web.gateway import Gateway
+
+#: Seconds between two listings without an event.
+PERIOD: Final = 1.0
+#: Events that a new page shows.
+MOST_EVENTS: Final = 500
+
+_log = logging.getLogger("rosrm.web")
+
+
+class Live:
+    """The newest listing of hosts and processes, and the newest events.
+
+    Attributes:
+        listing: None: there is none yet.
+        events: the newest ones, the oldest first.
+        on_change: called after each listing, and when the master is lost or back.
+    """
+
+    def __init__(self, gateway: Gateway) -> None:
+        self._gateway = gateway
+        self._woken = asyncio.Event()
+        self.listing: Listing | None = None
+        self.events: deque[EventRow] = deque(maxlen=MOST_EVENTS)
+        self.on_change: list[Callable[[], None]] = []
+        self._task: asyncio.Task[None] | None = None
+        gateway.watcher.on_events.append(self._take_events)
+        gateway.watcher.on_master.append(lambda _: self._woken.set())
+
+    async def join(self, on_change: Callable[[], None]) -> None:
+        """Call a function after each change, until `leave`."""
+        self.on_change.append(on_change)
+        if self._task is None:
+            await self._read()
+            self._task = asyncio.create_task(self._run())
+
+    def leave(self, on_change: Callable[[], None]) -> None:
+        """End the calls of a function; without any, nothing is read."""
+        self.on_change.remove(on_change)
+        if not self.on_change and self._task is not None:
+            self._task.cancel()
+            self._task = None
+
+    def wake(self) -> None:
+        """Read now, because an action may have changed something."""
+        self._gateway.forget_listings()
+        self._woken.set()
+
+    async def _run(self) -> None:
+        while True:
+            with suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._woken.wait(), PERIOD)
+            self._woken.clear()
+            await self._read()
+            for call in list(self.on_change):
+                call()
+
+    async def _read(self) -> None:
+        try:
+            self.listing = await self._gateway.list(hosts=True, processes=True)
+            if not self.events:
+                self.events.extend(await self._gateway.ask(self._gateway.reading, _newest))
+        except RosrmError:
+            return  # the watcher has the state of the master
+
+    def _take_events(self, rows: Sequence[EventRow]) -> None:
+        if self.events:
+            self.events.extend(rows)
+        self._woken.set()
+
+
+def _newest(client: Client) -> Sequence[EventRow]:
+    return client.list(events=True, newest=MOST_EVENTS, on_wait=give_up_early).events

@@ -1,0 +1,52 @@
+"""Form for the token of a user; a cookie carries it from then on."""
+
+from __future__ import annotations
+
+from html import escape
+from typing import TYPE_CHECKING, Final
+from urllib.parse import parse_qs
+
+from fastapi import Request
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
+
+from rosrm_web.tokens import COOKIE, user_of
+
+if TYPE_CHECKING:
+    from rosrm_web.settings import Settings
+
+_FORM: Final = """<!doctype html>
+<html lang="en"><head><title>rosrm: token</title><link rel="icon" href="data:,">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark"></head>
+<body><main><h1>rosrm</h1><p>{message}</p>
+<form method="post"><label>Token <input type="password" name="token" autofocus required
+autocomplete="current-password"></label> <button>Log in</button></form></main></body></html>
+"""
+
+
+class Login:
+    """Endpoints of the form."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    async def show(self) -> Response:
+        """Show the form."""
+        return _page("This gateway needs the token of a user.")
+
+    async def enter(self, request: Request) -> Response:
+        """Check the token of the form, and set the cookie."""
+        body = (await request.body()).decode("latin-1")
+        token = parse_qs(body).get("token", [""])[0].strip()
+        if user_of(f"Bearer {token}", self._settings.users) is None:
+            return _page("The token is wrong.", 401)
+        answer = RedirectResponse("/", 303)
+        answer.set_cookie(
+            COOKIE, token, httponly=True, samesite="strict",
+            secure=self._settings.certificate is not None,
+        )  # fmt: skip
+        return answer
+
+
+def _page(message: str, status: int = 200) -> Response:
+    return HTMLResponse(_FORM.format(message=escape(message)), status)

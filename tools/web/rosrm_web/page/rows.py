@@ -1,0 +1,144 @@
+"""Rows of the page's tables, and the problems of a cluster, from a listing. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+from rosrm.model.rows import EventRow, HostRow, Listing, ProcessRow, ResourceRow
+from rosrm.wording import counted, first_line, percent, size
+
+Row = Mapping[str, Any]
+
+#: States of processes that are not well.
+_BAD_PROCESSES: Final = ("failed", "unreachable", "stuck", "set_aside", "backoff")
+#: States of hosts that are not well.
+_BAD_HOSTS: Final = ("lost", "suspect")
+#: Resources of a host in the table of hosts, each with a column of its own.
+RESOURCES: Final = ("cpu", "memory", "disk")
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Hosts or processes in one bad state.
+
+    Attributes:
+        table: "hosts" or "processes".
+        state: of all of them.
+        text: number and state.
+    """
+
+    table: str
+    state: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Changed:
+    """The difference of two tables, as a transaction of AG Grid."""
+
+    add: Sequence[Row]
+    update: Sequence[Row]
+    remove: Sequence[Row]
+
+    def __bool__(self) -> bool:
+        return bool(self.add or self.update or self.remove)
+
+    def transaction(self) -> dict[str, Sequence[Row]]:
+        """Return the argument of `applyTransaction`."""
+        return {"add": self.add, "update": self.update, "remove": self.remove}
+
+
+def changed(before: Mapping[str, Row], after: Mapping[str, Row]) -> Changed:
+    """Return the difference of two tables by the ids of their rows."""
+    return Changed(
+        [row for key, row in after.items() if key not in before],
+        [row for key, row in after.items() if key in before and before[key] != row],
+        [{"id": key} for key in before if key not in after],
+    )
+
+
+def host_rows(hosts: Iterable[HostRow]) -> dict[str, Row]:
+    """Return the rows of the table of hosts by their ids."""
+    return {row.description.name: _host(row) for row in hosts}
+
+
+def _host(row: HostRow) -> Row:
+    marks = [
+        name for name, is_set in (("cordoned", row.cordoned), ("draining", row.draining)) if is_set
+    ]
+    resources = {one.name: one for one in row.resources}
+    usages = {name: resources[name] for name in RESOURCES if name in resources}
+    others = [
+        f"{name} {percent(one.usage)} %" for name, one in resources.items() if name not in usages
+    ]
+    free = sum(one.free > 0 for one in row.devices)
+    devices = [f"{free} of {counted(len(row.devices), 'device')} free"] if row.devices else []
+    return {
+        "id": row.description.name,
+        "host": row.description.name,
+        "state": ", ".join([row.state, *marks]),
+        "processes": row.processes,
+        **{name: _usage(one) for name, one in usages.items()},
+        **{f"{name}_share": round(one.usage, 2) for name, one in usages.items()},
+        **{f"{name}_limit": round(one.limit, 2) for name, one in usages.items()},
+        "labels": ", ".join(f"{key}={value}" for key, value in row.description.labels.items()),
+        "more": ", ".join([*others, *devices]),
+    }
+
+
+def _usage(resource: ResourceRow) -> str:
+    text = f"{percent(resource.usage)} % of {percent(resource.limit)} %"
+    return f"{text} (old)" if resource.stale else text
+
+
+def process_rows(processes: Iterable[ProcessRow]) -> dict[str, Row]:
+    """Return the rows of the table of processes by their ids."""
+    return {row.name: _process(row) for row in processes}
+
+
+def _process(row: ProcessRow) -> Row:
+    return {
+        "id": row.name,
+        "application": row.application,
+        "process": row.name,
+        "state": row.state,
+        "host": row.host,
+        "cpu": f"{row.cpu:.2f}" if row.cpu else "",
+        "memory": size(row.memory) if row.memory else "",
+        "restarts": row.restarts or "",
+        "why": first_line(row.reason),
+    }
+
+
+def event_rows(events: Iterable[EventRow], newest: int) -> dict[str, Row]:
+    """Return the rows of the newest events, by their ids."""
+    return {str(row.sequence): _event(row) for row in list(events)[-newest:]}
+
+
+def _event(row: EventRow) -> Row:
+    return {
+        "id": str(row.sequence),
+        "sequence": row.sequence,
+        "time": row.wall_time,
+        "kind": row.kind,
+        "process": row.process,
+        "host": row.host,
+        "message": first_line(row.message),
+    }
+
+
+def problems(listing: Listing) -> list[Problem]:
+    """Return what is wrong, hosts first."""
+    tables = (
+        ("hosts", _BAD_HOSTS, [row.state for row in listing.hosts], "host", "hosts"),
+        ("processes", _BAD_PROCESSES, [row.state for row in listing.processes],
+         "process", "processes"),
+    )  # fmt: skip
+    return [
+        Problem(table, state, f"{counted(number, one, many)} {state.replace('_', ' ')}")
+        for table, bad, states, one, many in tables
+        for state in bad
+        if (number := states.count(state))
+    ]

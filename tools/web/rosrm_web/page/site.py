@@ -1,0 +1,123 @@
+"""The page: its header, its tabs, and its connection to the cluster."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from nicegui import app as nicegui_app
+from nicegui import ui
+
+from rosrm_web.page import dialogs, rows, views
+from rosrm_web.page.live import Live
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+
+    from rosrm_web.gateway import Gateway
+
+#: Events in the table.
+_SHOWN_EVENTS: Final = 200
+_STYLE: Final = """
+:root { --rosrm-bar: #9fc5e8; --rosrm-over: #f4a6a6; }
+.body--dark { --rosrm-bar: #1f4e79; --rosrm-over: #7f1d1d; }
+.rosrm-grid { height: calc(100vh - 13rem); min-height: 16rem; }
+.rosrm-bad { color: #b00020; font-weight: 700; }
+.rosrm-poor { color: #8a5a00; font-weight: 700; }
+.body--dark .rosrm-bad { color: #ff8a80; }
+.body--dark .rosrm-poor { color: #ffd180; }
+"""
+
+
+def mount(app: FastAPI, gateway: Gateway) -> None:
+    """Add the page to the application of the gateway, at `/`."""
+    live = Live(gateway)
+    nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
+    ui.page("/", title="rosrm", dark=None)(partial(_page, gateway, live))
+    ui.run_with(app, show_welcome_message=False, language="en-US")
+
+
+async def _page(gateway: Gateway, live: Live) -> None:
+    client = ui.context.client
+    request = client.request
+    page = Page(gateway, live, may_act=bool(request.scope["may_act"]))
+    client.on_delete(page.leave)
+    await live.join(page.update)
+    page.update()
+
+
+class Page:
+    """The page of one browser.
+
+    Args:
+        gateway: sends the requests.
+        live: has the newest listing.
+        may_act: the user is an operator, and the gateway acts.
+    """
+
+    def __init__(self, gateway: Gateway, live: Live, *, may_act: bool) -> None:
+        self._gateway, self._live = gateway, live
+        ui.add_css(_STYLE)
+        ui.colors(primary="#1b4f8a", negative="#b00020")
+        self._header(may_act=may_act)
+        of_process, of_host = (dialogs.OF_PROCESS, dialogs.OF_HOST) if may_act else ((), ())
+        self._process = dialogs.ProcessDialog(gateway, of_process, live.wake)
+        self._host = dialogs.Dialog(gateway, of_host, live.wake)
+        with ui.tabs() as self._tabs:
+            for name in ("hosts", "processes", "events"):
+                ui.tab(name, name.capitalize()).props("no-caps")
+        panels = ui.tab_panels(self._tabs, value="hosts", keep_alive=True, animated=False)
+        with panels.classes("w-full"):
+            with ui.tab_panel("hosts").classes("p-0"):
+                on_host = self._host.open if may_act else None
+                self._hosts = views.Table(views.HOSTS, "Hosts", on_host)
+            with ui.tab_panel("processes").classes("p-0"):
+                self._processes = views.Table(views.PROCESSES, "Processes", self._process.open)
+            with ui.tab_panel("events").classes("p-0"):
+                self._events = views.Table(views.EVENTS, "Events")
+        self._problems: list[rows.Problem] = []
+
+    def _header(self, *, may_act: bool) -> None:
+        with ui.header().classes("items-center"):
+            ui.label("rosrm").classes("text-h6").props("role=heading aria-level=1")
+            self._state = ui.label().props("role=status aria-live=polite")
+            ui.space()
+            ui.label("operator" if may_act else "read-only")
+        self._strip = ui.row().classes("w-full").props('role=region aria-label="Problems"')
+
+    def update(self) -> None:
+        """Show the newest listing and events."""
+        master = self._gateway.watcher.master
+        self._state.text = f"master: {master.reason or 'up'}"
+        listing = self._live.listing
+        if listing is None:
+            return
+        self._hosts.show(rows.host_rows(listing.hosts))
+        self._processes.show(rows.process_rows(listing.processes))
+        self._events.show(rows.event_rows(self._live.events, _SHOWN_EVENTS))
+        found = rows.problems(listing)
+        if found != self._problems:
+            self._show_problems(found)
+
+    def _show_problems(self, found: list[rows.Problem]) -> None:
+        self._problems = found
+        self._strip.clear()
+        with self._strip:
+            for problem in found:
+                button = ui.button(problem.text, on_click=partial(self._filter, problem))
+                button.props("color=negative dense no-caps").classes("px-2")
+            if found:
+                ui.button("Show all", on_click=self._show_all).props("dense no-caps")
+
+    def _filter(self, problem: rows.Problem) -> None:
+        self._tabs.value = problem.table
+        table = self._hosts if problem.table == "hosts" else self._processes
+        table.narrow(state=problem.state)
+
+    def _show_all(self) -> None:
+        self._hosts.narrow()
+        self._processes.narrow()
+
+    def leave(self) -> None:
+        """End the updates of this browser."""
+        self._live.leave(self.update)
