@@ -9,12 +9,14 @@ import socket
 import ssl
 import subprocess
 import sys
+from contextlib import suppress
 
 import pytest
 
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.testing.loopback import settings_on_this_machine
 from tests.ros.web_kit import gateway
+from tests.waiting import PATIENCE
 
 TOKEN = "v" * 32
 
@@ -34,14 +36,41 @@ def web(ros):
 
 
 def test_without_a_master_the_gateway_searches(web):
-    """It answers at once, and each request for data gets the reason."""
+    """The gateway answers at once; each request for data gets the reason."""
     status = web.get("/v1/status")
     assert (list(status), status["gateway"]["state"]) == (["gateway"], "searching")
 
     answer = web.ask("/v1/hosts")
-    assert (answer.status, answer.json["detail"][:9]) == (503, "no master")
+    # The reason is that no master answers or, before the first master of this user, that there is
+    # no key.
+    assert (answer.status, answer.json["detail"] != "") == (503, True)
+    assert status["gateway"]["reason"]
     with web.follow() as changes:
         assert next(changes).data["state"] == "searching"
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        b"\x16\x03\x01\x02\x00\x01" + bytes(300),  # TLS
+        b"GET / HTTP/9.9\r\n\r\n",
+        b"\r\n" * 1000 + b"?",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nHost: evil.example\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nContent-Length: -1\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\nzz\r\n",
+        b"GET /" + b"x" * 100_000 + b" HTTP/1.1\r\nHost: localhost\r\n\r\n",
+        b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"x" * 100_000 + b"\r\n\r\n",
+        b"GET http://evil.example/v1/status HTTP/1.1\r\nHost: evil.example\r\n\r\n",
+    ],
+)
+def test_a_broken_request_is_refused(web, sent):
+    """The connection ends with an error at most, and the next request is answered."""
+    with socket.create_connection(web.address, timeout=PATIENCE) as client, suppress(OSError):
+        client.sendall(sent)
+        client.shutdown(socket.SHUT_WR)
+        answer = b"".join(iter(lambda: client.recv(65536), b""))
+        assert not answer or int(answer.split()[1]) >= 400
+    assert web.ask("/v1/status").status == 200
 
 
 def test_a_port_in_use_is_one_sentence(ros):

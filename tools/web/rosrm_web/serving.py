@@ -57,7 +57,7 @@ def open_socket(settings: Settings) -> socket.socket:
 
 
 def url_of(listener: socket.socket, settings: Settings) -> str:
-    """Return the address of the gateway for people."""
+    """Return the URL of the gateway."""
     address, port = listener.getsockname()[:2]
     shown = f"[{address}]" if ":" in address else address
     return f"{settings.scheme}://{shown}:{port}"

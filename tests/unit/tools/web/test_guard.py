@@ -151,7 +151,7 @@ def test_a_header_that_decides_is_there_once(name):
 
 
 def test_every_answer_has_the_headers_of_a_strict_page():
-    """Of accepted and of refused requests; an application may choose a value of its own."""
+    """Accepted and refused requests have them; an application may choose its own value."""
 
     async def page(scope, receive, send):
         own = [(b"Content-Security-Policy", b"default-src 'self'")]

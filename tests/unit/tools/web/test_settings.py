@@ -72,7 +72,7 @@ def test_a_missing_file_is_refused(tmp_path):
 
 
 def test_a_port_in_use_is_one_clear_error():
-    """It names the port and a way out."""
+    """The error names the port and another one."""
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         with pytest.raises(ConfigError, match=f"port {port} is in use, .* give another port"):
