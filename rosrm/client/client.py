@@ -298,6 +298,13 @@ class Client:
         """Return the plugins of the master and of all hosts, with their states."""
         return self.list(plugins=True).plugins
 
+    def master_load(self) -> Mapping[str, float]:
+        """Return figures of the master's newest load; empty: none has arrived yet.
+
+        The first call begins to follow them. They arrive once a second, during other requests.
+        """
+        return self._master.load()
+
     def get_process(self, name: str) -> ProcessRow:
         """Return a process; raise `Refused` for an unknown name."""
         return row_of("process", name, {row.name: row for row in self.list_processes()})

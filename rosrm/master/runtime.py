@@ -313,6 +313,7 @@ class MasterRuntime:
                 self._take_in(now)
                 if self._diagnostics is not None:
                     self._diagnostics.advance(now, self._core_now(now), self._trouble())
+                self._endpoint.note_turn(self._now() - now)
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
 
@@ -465,7 +466,11 @@ class MasterRuntime:
         intents = [command for command in commands if isinstance(command, Intent)]
         if not records and not intents:
             return ()
-        return self._journal.write(records, intents, self._now() - self._started)
+        begun = self._now()
+        try:
+            return self._journal.write(records, intents, begun - self._started)
+        finally:
+            self._endpoint.note_write(self._now() - begun)
 
 
 def what_runs(state: MasterState) -> str:

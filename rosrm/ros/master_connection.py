@@ -27,6 +27,7 @@ from rosrm.ros.bounds import check_bounds
 from rosrm.ros.control import ControlClient, check_answer
 from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.ros.introductions import introduction_of, introduction_request
+from rosrm.ros.load_reader import LoadReader
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
 from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of, positions_from_text
@@ -233,6 +234,7 @@ class MasterClient:
         self._control = ControlClient(participant, f"client {name}")
         self._clients: dict[str, SealedClient] = {}
         self._slaves: dict[tuple[str, str], _Slave] = {}
+        self._load: LoadReader | None = None
 
     @classmethod
     def connect(
@@ -327,6 +329,12 @@ class MasterClient:
         )  # fmt: skip
         answer = self._call(srv.StoreArtifact, names.STORE_ARTIFACT, request)
         return int(answer.next_offset)
+
+    def load(self) -> Mapping[str, float]:
+        """Return figures of the master's newest load; the first call begins to follow them."""
+        if self._load is None:
+            self._load = LoadReader(self._endpoints, self._names(names.MASTER_LOAD))
+        return self._load.newest
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""

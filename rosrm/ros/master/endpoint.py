@@ -91,6 +91,7 @@ class MasterEndpoint:
         self._loads = endpoints.announcer(msg.Event, path(names.MASTER_LOAD), qos.LOAD)
         self._load_at = 0.0
         self._oldest: list[float] = []
+        self._longest_turn = self._longest_write = 0.0
 
     def shut_revoked(self) -> None:
         """End the conversations with slaves whose key is no longer valid."""
@@ -106,6 +107,14 @@ class MasterEndpoint:
         if readings is not None:
             # Placed first, because a usage must not be judged by readings older than it.
             self.events.insert(0, readings)
+
+    def note_turn(self, seconds: float) -> None:
+        """Note the duration of a turn of the master's loop, for its load."""
+        self._longest_turn = max(self._longest_turn, seconds)
+
+    def note_write(self, seconds: float) -> None:
+        """Note the duration of a write of the journal, for the master's load."""
+        self._longest_write = max(self._longest_write, seconds)
 
     def take_events(self) -> list[happened.Event]:
         """Return the events since the last call, in order, preceded by the newest readings."""
@@ -144,7 +153,9 @@ class MasterEndpoint:
         facts = {
             "hosts": hosts, "cycles": stats.cycles, "missed": stats.missed,
             "cpu_s": time.process_time(), "oldest_reading_s": [round(age, 4) for age in oldest],
+            "turn_s": round(self._longest_turn, 6), "write_s": round(self._longest_write, 6),
         }  # fmt: skip
+        self._longest_turn = self._longest_write = 0.0
         self._loads.publish(
             msg.Event(
                 wall_time=time.time(), elapsed=uptime, kind="load", data=json.dumps(facts),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
@@ -55,6 +55,7 @@ class Watcher:
 
     Attributes:
         master: newest known state of the master.
+        load: figures of the master, as `Client.master_load` returns them.
         on_master: called with each new state of the master.
         on_events: called with new events, the oldest first.
     """
@@ -63,6 +64,7 @@ class Watcher:
         self._link = link
         self._after = -1
         self.master = MasterState()
+        self.load: Mapping[str, float] = {}
         self.on_master: list[Callable[[MasterState], None]] = []
         self.on_events: list[Callable[[Sequence[EventRow]], None]] = []
 
@@ -87,6 +89,7 @@ class Watcher:
             call(listing.events)
 
     def _list(self, client: Client) -> Listing:
+        self.load = client.master_load()
         if self._after < 0:  # the events before the first request are no changes
             return client.list(on_wait=give_up_early)
         return client.list(

@@ -45,6 +45,7 @@ def event(kind, process="talker", wall=0.0, **facts):
 
 RESOURCES = (resource("memory", 0.4), resource("cpu", 0.9, stale=True))
 HOST = HostRow(HostDescription("alpha", 7), 1, "up", False, True, True, 0.1, RESOURCES, 1)
+LOAD = {"turn_s": 0.02, "write_s": 0.01, "cpu_s": 5, "oldest_reading_s": 0.2, "missed": 3}
 LISTING = Listing(
     "lab", 60.0, 9, hosts=[HOST],
     processes=[
@@ -90,7 +91,9 @@ def test_the_text_has_every_metric_with_the_labels_of_the_table():
     counted.count([event(EventKind.MIGRATED, strategy="relaunch", seconds=2.0)])
     families = {
         family.name: family
-        for family in text_string_to_metric_families(exposition(LISTING, 0.1, counted).decode())
+        for family in text_string_to_metric_families(
+            exposition(LISTING, 0.1, counted, LOAD).decode()
+        )
     }
 
     assert set(families) == {name.removesuffix("_total") for name in METRICS}
@@ -103,8 +106,9 @@ def test_the_text_has_every_metric_with_the_labels_of_the_table():
 
 def test_the_values_of_a_listing():
     """Stale readings have no usage, and ended processes no metrics of their own."""
-    found = values(exposition(LISTING, 0.25))
+    found = values(exposition(LISTING, 0.25, load=LOAD))
 
+    assert found["rosrm_journal_write_seconds",] == 0.01
     assert found["rosrm_up",] == 1.0
     assert found["rosrm_master_answer_seconds",] == 0.25
     assert found["rosrm_host_cordoned", "alpha"] == 1.0
@@ -121,6 +125,12 @@ def test_the_values_of_a_listing():
 def test_without_a_master_only_that_is_known():
     """The alert on a lost master needs a value."""
     assert values(exposition(None)) == {("rosrm_up",): 0.0}
+
+
+def test_figures_that_have_not_arrived_have_no_value():
+    """The master publishes its load once a second, and an older master has fewer figures."""
+    assert not any(name == "rosrm_master_turn_seconds" for name, *_ in values(exposition(LISTING)))
+    assert [value for _, _, value in sampling.of_load({"turn_s": 0.5, "strange": 1.0})] == [0.5]
 
 
 def test_the_number_of_series_is_bounded():

@@ -81,7 +81,9 @@ def _look(
         return exposition(None, 0.0, counted), after
     if counted is not None:
         counted.count(listing.events)
-    return exposition(listing, time.monotonic() - begun, counted), listing.last_sequence
+    seconds = time.monotonic() - begun
+    load = client.master_load() if counted is not None else {}
+    return exposition(listing, seconds, counted, load), listing.last_sequence
 
 
 def _write(content: bytes, textfile: Path | None) -> None:

@@ -36,6 +36,7 @@ class Metrics:
                 hosts=True, processes=True, applications=True, plugins="failing"
             )
         seconds = time.monotonic() - begun
-        write = partial(exposition, listing, seconds, self._counted)
+        load = self._gateway.watcher.load
+        write = partial(exposition, listing, seconds, self._counted, load)
         content = await asyncio.get_running_loop().run_in_executor(None, write)
         return Response(content, media_type=MEDIA_TYPE)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from prometheus_client import (
@@ -13,7 +14,7 @@ from prometheus_client import (
 )
 
 from rosrm_web.metrics import table
-from rosrm_web.metrics.sampling import samples
+from rosrm_web.metrics.sampling import of_load, samples
 
 if TYPE_CHECKING:
     from rosrm.model.rows import Listing
@@ -26,18 +27,20 @@ disable_created_metrics()  # a series with a time of creation beside each counte
 
 
 def exposition(
-    listing: Listing | None, seconds: float = 0.0, counted: EventMetrics | None = None
-) -> bytes:
+    listing: Listing | None, seconds: float = 0.0, counted: EventMetrics | None = None,
+    load: Mapping[str, float] = MappingProxyType({}),
+) -> bytes:  # fmt: skip
     """Return all metrics as text.
 
     Args:
         listing: with hosts, processes, applications and failing plugins; None: no master answers.
         seconds: in which the master answered.
         counted: metrics of events; None: none were counted.
+        load: of the master, as `Client.master_load` returns it.
     """
     values: list[Sample] = [(table.UP, (), float(listing is not None))]
     if listing is not None:
-        values += samples(listing, seconds)
+        values += [*samples(listing, seconds), *of_load(load)]
     after = b"" if counted is None else bytes(generate_latest(counted.registry))
     return _present(values) + after
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final, get_args
 
 from rosrm.model.applications import ApplicationState
@@ -25,6 +25,10 @@ _PROCESS_STATES: Final = (
     "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck",
     "unknown",
 )  # fmt: skip
+_OF_LOAD: Final = {
+    "turn_s": table.TURN, "write_s": table.WRITE, "cpu_s": table.MASTER_CPU,
+    "oldest_reading_s": table.OLDEST, "missed": table.MISSED,
+}  # fmt: skip
 _ENDED: Final = frozenset({"finished", "failed", "cancelled"})
 
 
@@ -48,6 +52,13 @@ def samples(listing: Listing, seconds: float) -> Iterator[Sample]:
         yield from _of_host(host)
     yield from _of_queue(listing.processes)
     yield from _of_processes(listing.processes)
+
+
+def of_load(load: Mapping[str, float]) -> Iterator[Sample]:
+    """Return the values of `Client.master_load`; none of them until its first message."""
+    for name, metric in _OF_LOAD.items():
+        if name in load:
+            yield metric, (), float(load[name])
 
 
 def _counts(metric: Metric, known: Iterable[str], states: Iterable[str]) -> Iterator[Sample]:

@@ -32,6 +32,23 @@ ANSWER: Final = Metric(
     "rosrm_master_answer_seconds", "gauge", (),
     "seconds in which the master answered the newest listing, with its transport",
 )  # fmt: skip
+TURN: Final = Metric(
+    "rosrm_master_turn_seconds", "gauge", (), "longest turn of the master's loop within a second"
+)
+WRITE: Final = Metric(
+    "rosrm_journal_write_seconds", "gauge", (), "longest write of the journal within a second"
+)
+MASTER_CPU: Final = Metric(
+    "rosrm_master_cpu_seconds", "gauge", (), "CPU time of the master since its start"
+)
+OLDEST: Final = Metric(
+    "rosrm_oldest_reading_seconds", "gauge", (),
+    "age of the oldest among the newest readings of all hosts, at most within a second",
+)  # fmt: skip
+MISSED: Final = Metric(
+    "rosrm_missed_cycles", "gauge", (),
+    "cycles of slaves whose messages did not arrive, since the start of the master",
+)  # fmt: skip
 TROUBLE: Final = Metric(
     "rosrm_master_trouble", "gauge", (),
     "1: the master accepts no new work, for example in a journal stall",
@@ -104,8 +121,8 @@ START: Final = Metric(
 
 #: Metrics of the present, and metrics that events count.
 PRESENT: Final = (
-    UP, UPTIME, ANSWER, TROUBLE, SEQUENCE, HOSTS, HOST_UP, HOST_CORDONED, HOST_AGE, HOST_PROCESSES,
-    USAGE, IN_FLIGHT, LIMIT, CAPACITY, PROCESSES, QUEUE, QUEUE_AGE, CPU, MEMORY, RESTARTS, LEFT_OUT,
-    APPLICATIONS, PLUGINS,
+    UP, UPTIME, ANSWER, TURN, WRITE, MASTER_CPU, OLDEST, MISSED, TROUBLE, SEQUENCE,
+    HOSTS, HOST_UP, HOST_CORDONED, HOST_AGE, HOST_PROCESSES, USAGE, IN_FLIGHT, LIMIT, CAPACITY,
+    PROCESSES, QUEUE, QUEUE_AGE, CPU, MEMORY, RESTARTS, LEFT_OUT, APPLICATIONS, PLUGINS,
 )  # fmt: skip
 COUNTED: Final = (EVENTS, MIGRATIONS, MIGRATION_TIME, WAIT, START)
