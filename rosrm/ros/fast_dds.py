@@ -29,6 +29,13 @@ _ONLY_TRANSPORT: Final = """\
       <useBuiltinTransports>false</useBuiltinTransports>
 """
 
+#: Seconds without a message after which peers remove a master, slave or client; by default 20. A
+#: process that was stopped for longer than this removes all of its peers when it continues, and
+#: Fast DDS 2.14 may ignore some of them from then on (docs/decisions/0065).
+LEASE: Final = 120
+_LEASE: Final = f"<leaseDuration><sec>{LEASE}</sec></leaseDuration>"
+_BEFORE: Final = "<leaseAnnouncement>"
+
 Pace = Literal["eager", "steady"]
 
 
@@ -60,8 +67,20 @@ def announcing(environment: MutableMapping[str, str], pace: Pace, *, udp: bool) 
 
 
 @contextlib.contextmanager
+def announcing_part(environment: MutableMapping[str, str], pace: Pace) -> Iterator[None]:
+    """Apply `announcements` with `LEASE` to the participant of a master, slave or client."""
+    variables = announcements(environment, pace, udp=True)
+    if not variables:
+        yield
+        return
+    profile = Path(variables[_VARIABLES[0]]).read_text(encoding="utf-8")
+    with _applied(environment, variables, profile):
+        yield
+
+
+@contextlib.contextmanager
 def bound(environment: MutableMapping[str, str], pace: Pace, interface: str) -> Iterator[None]:
-    """Bind a participant to one network interface, as `announcing` with `udp`.
+    """Bind a participant to one network interface, as `announcing_part`.
 
     Fast DDS reads its profile once, for the first participant of a process. The profile replaces a
     profile of the user.
@@ -71,10 +90,19 @@ def bound(environment: MutableMapping[str, str], pace: Pace, interface: str) -> 
         pace: frequency of the announcements.
         interface: name or IPv4 address of the interface.
     """
+    with _applied(environment, {_TRANSPORTS: _UDP}, _bound_profile(pace, interface)):
+        yield
+
+
+@contextlib.contextmanager
+def _applied(
+    environment: MutableMapping[str, str], variables: Mapping[str, str], profile: str
+) -> Iterator[None]:
+    """Apply variables, and a profile with `LEASE` in a temporary file."""
     with tempfile.NamedTemporaryFile("w", prefix="rosrm-", suffix=".xml") as file:
-        file.write(_bound_profile(pace, interface))
+        file.write(profile.replace(_BEFORE, f"{_LEASE}{_BEFORE}", 1))
         file.flush()
-        with _changed(environment, {_VARIABLES[0]: file.name, _TRANSPORTS: _UDP}):
+        with _changed(environment, {**variables, _VARIABLES[0]: file.name}):
             yield
 
 

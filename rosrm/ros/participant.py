@@ -22,7 +22,7 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.callback_guard import CallbackGuard
-from rosrm.ros.fast_dds import Pace, announcing, bound
+from rosrm.ros.fast_dds import Pace, announcing_part, bound
 from rosrm.ros.network_interface import check_interface
 from rosrm.version import PROTOCOL_VERSION
 
@@ -70,7 +70,7 @@ class Participant:
             check_interface(interface)
             profile = bound(os.environ, pace, interface)
         else:
-            profile = announcing(os.environ, pace, udp=True)
+            profile = announcing_part(os.environ, pace)
         with profile:
             # Without the logging of ROS, which would leave an empty file for each command. Unlike
             # `rclpy.init`, this installs no signal handlers.

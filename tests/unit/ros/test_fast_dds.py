@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from rosrm.errors import ConfigError
-from rosrm.ros.fast_dds import announcements, announcing, bound
+from rosrm.ros.fast_dds import LEASE, announcements, announcing, announcing_part, bound
 from rosrm.ros.network_interface import check_interface
 
 
@@ -67,9 +67,25 @@ def test_the_profile_for_udp_differs_by_its_locators_alone(pace):
 def test_what_the_user_has_set_stands(variable):
     """The variable has its value afterwards, too."""
     environment = {variable: "/etc/robot.xml"}
-    with announcing(environment, "steady", udp=True):
+    with announcing(environment, "steady", udp=True), announcing_part(environment, "steady"):
         assert environment == {variable: "/etc/robot.xml"}
     assert environment == {variable: "/etc/robot.xml"}
+
+
+@pytest.mark.parametrize("pace", ["eager", "steady"])
+def test_peers_remove_a_part_of_rosrm_late(pace):
+    """A node keeps the default, because the graph shows it for so long after a kill."""
+    environment = {}
+    with announcing_part(environment, pace):
+        path = Path(environment["FASTRTPS_DEFAULT_PROFILES_FILE"])
+        profile = path.read_text()
+    assert f"<leaseDuration><sec>{LEASE}</sec></leaseDuration>" in profile
+    assert ET.fromstring(profile.split("-->", 1)[1]).tag.endswith("profiles")
+    assert not path.exists()
+    assert environment == {}
+    for udp in (False, True):
+        of_node = Path(announcements({}, pace, udp=udp)["FASTRTPS_DEFAULT_PROFILES_FILE"])
+        assert "leaseDuration" not in of_node.read_text()
 
 
 # --- one network interface ----------------------------------------------------------------------
@@ -92,6 +108,7 @@ def test_a_bound_participant_has_one_transport_with_one_interface(pace, before):
     assert chosen.text == made.text
     assert profile.find("participant/rtps/useBuiltinTransports", names).text == "false"
     assert profile.find(".//initialAnnouncements/count", names).text == "60"
+    assert profile.find(".//leaseDuration/sec", names).text == str(LEASE)
     assert (profile.find(".//heartbeatPeriod", names) is not None) == (pace == "steady")
 
 
