@@ -163,7 +163,7 @@ def test_transitions_of_unknown_nodes_are_listed():
         ("events.launch.py", ["OnProcessIO", "OnProcessExit", "OnShutdown", "EmitEvent"]),
         (
             "scopes.launch.py",
-            ["SetROSLogDir", "environment of alone", "OnProcessStart", "Node"],
+            ["SetROSLogDir", "environment of alone", "OnProcessStart", "Node told"],
         ),
         ("lifecycle.launch.py", ["OnStateTransition", "transition inactive_shutdown of /maps"]),
         ("components.launch.py", ["component demo::Unnamed of /camera/pipeline"]),

@@ -25,7 +25,7 @@ from rosrm_launch.visiting import (
     replacements,
     transitions,
 )
-from rosrm_launch.visiting.state import Deferred, Visit
+from rosrm_launch.visiting.state import Deferred, Visit, hidden
 
 
 def resolved(file: str, given: Mapping[str, str]) -> LaunchModel:
@@ -79,7 +79,9 @@ def _entity(visit: Visit, entity: Any) -> None:
         if entity.condition is None or entity.condition.evaluate(visit.context):
             _action(visit, entity)
     except events.EventNeeded as reason:
-        visit.omit(entity, str(reason))
+        name = hidden(entity, ros.Node, "node_name")
+        title = f"{type(entity).__name__} {name}" if isinstance(name, str) else ""
+        visit.omit(entity, str(reason), title)
 
 
 def _action(visit: Visit, action: Any) -> None:
