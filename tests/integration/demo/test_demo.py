@@ -53,6 +53,9 @@ def test_a_short_demo_fills_the_hosts_maps_the_drive_and_migrates(start: Start) 
     for name in ("map.png", "usage.png"):
         assert (run.out / name).read_bytes().startswith(b"\x89PNG")
     assert (run.out / "map.ply").read_bytes().startswith(b"ply\n")
+    page = (run.out / "report.html").read_text()
+    assert "Usage of memory" in page
+    assert "is over its limit of memory" in page
     assert len(json.loads((run.out / "samples.json").read_text())["samples"]) > 20
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 from rosrm.model.event_kinds import EventKind
@@ -24,6 +24,8 @@ from rosrm_report.model import (
 
 #: Largest distance of two scores that are nearly the same, part of the larger one.
 _CLOSE: Final = 0.1
+#: Unix time after which no event can be, in the year 9999.
+_LATEST: Final = 2.5e11
 _FAILS: Final = frozenset({EventKind.FAILED, EventKind.BACKOFF})
 _GONE: Final = {
     EventKind.HOST_LOST: "lost", EventKind.HOST_LEFT: "left", EventKind.HOST_DETACHED: "detached",
@@ -35,7 +37,8 @@ Timed = Sequence[tuple[float, EventRow]]
 
 def report_of(material: Material, title: str = "") -> Report:
     """Return the report of a run; the failures have no log lines yet."""
-    timed = timed_events(material.events)
+    kept = [one for one in material.events if _is_timed(one)]
+    timed = timed_events(kept)
     readings = material.readings
     ends = [time for time, _ in timed[-1:]]
     end = max([*ends, *readings.times[-1:]] if readings else ends, default=0.0)
@@ -45,9 +48,9 @@ def report_of(material: Material, title: str = "") -> Report:
     return Report(
         title=title or f"Run of {material.name}",
         source=material.name,
-        began=material.events[0].wall_time if material.events else 0.0,
+        began=kept[0].wall_time if kept else 0.0,
         length=end,
-        notes=(*material.notes, *_gaps(material)),
+        notes=(*material.notes, *_gaps(kept, material)),
         outcomes=histories.outcomes,
         hosts=tuple(_host_figures(timed, histories, failures, over, readings)),
         placements=tuple(histories.placements),
@@ -83,9 +86,16 @@ def timed_events(events: Sequence[EventRow]) -> Timed:
     return timed
 
 
-def _gaps(material: Material) -> Iterable[str]:
+def _is_timed(event: EventRow) -> bool:
+    """Return True if the times of an event are possible; those of a damaged one may not be."""
+    return 0.0 <= event.wall_time < _LATEST and 0.0 <= event.elapsed < _LATEST
+
+
+def _gaps(events: Sequence[EventRow], material: Material) -> Iterable[str]:
     """Return sentences on missing parts of a run."""
-    events = material.events
+    damaged = len(material.events) - len(events)
+    if damaged:
+        yield f"{counted(damaged, 'event')} with impossible times left out."
     if not events:
         yield "No events: nothing is known about this run."
     elif events[0].sequence > 1:
@@ -159,17 +169,25 @@ def _over_limit(timed: Timed, end: float) -> tuple[HostSpan, ...]:
 
 def _close_decisions(timed: Timed) -> Iterable[CloseDecision]:
     for time, event in timed:
-        decision = event.facts.get("decision")
-        if event.kind != EventKind.ASSIGNED or not isinstance(decision, dict):
-            continue
-        scores = {one["name"]: one["score"] for one in decision.get("hosts", ())}
+        scores = _scores(event) if event.kind == EventKind.ASSIGNED else {}
         chosen = scores.pop(event.host, None)
-        others = [(score, name) for name, score in scores.items() if score is not None]
-        if chosen is None or not others:
+        if chosen is None or not scores:
             continue
-        score, name = min(others)
+        name, score = min(scores.items(), key=lambda one: one[1])
         if abs(score - chosen) <= _CLOSE * max(abs(score), abs(chosen)):
             yield CloseDecision(time, event.process, event.host, chosen, name, score)
+
+
+def _scores(event: EventRow) -> dict[str, float]:
+    """Return the score of each host that could take the process."""
+    decision = event.facts.get("decision")
+    hosts = decision.get("hosts") if isinstance(decision, Mapping) else None
+    named = [one for one in hosts if isinstance(one, Mapping)] if isinstance(hosts, list) else []
+    return {
+        str(one.get("name")): float(one["score"])
+        for one in named
+        if isinstance(one.get("score"), float | int)
+    }
 
 
 def _host_figures(

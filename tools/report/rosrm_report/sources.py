@@ -7,6 +7,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -114,11 +115,18 @@ def _readings_of_samples(plain: Mapping[str, Any], began: float) -> Readings:
     samples, hosts = plain["samples"], plain["hosts"]
     resources = sorted({name for sample in samples for name in sample["usage"]})
     usage = {
-        name: {host: tuple(s["usage"].get(name, {}).get(host) for s in samples) for host in hosts}
+        name: {
+            host: tuple(_known(s["usage"].get(name, {}).get(host)) for s in samples)
+            for host in hosts
+        }
         for name in resources
     }
     limits = {name: dict.fromkeys(hosts, float(of)) for name, of in plain["limits"].items()}
     return Readings(tuple(float(s["elapsed"]) - began for s in samples), usage, limits)
+
+
+def _known(value: Any) -> float | None:
+    return float(value) if isinstance(value, float | int) and isfinite(value) else None
 
 
 # --- a journal --------------------------------------------------------------------------------

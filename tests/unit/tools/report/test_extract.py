@@ -1,4 +1,4 @@
-"""What a report says of a run, by its events."""
+"""Reports of hand-made events."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_process_is_on_its_host_from_its_assignment_to_its_end():
 
 
 def test_a_process_without_an_end_runs_or_waits_to_the_end_of_the_report():
-    """A report of a run that goes on says so."""
+    """The run may still go on when the report is made."""
     made = report(
         (0, "submitted", "p"), (0, "submitted", "q"), (1, "assigned", "p", "a", "", {"number": 1}),
         (5, "host_cordoned", "", "a"),
@@ -56,7 +56,7 @@ def test_a_migration_is_a_move_with_its_cause():
 
 
 def test_a_migration_that_failed_leaves_the_process_where_it_was():
-    """It is listed with the reason and counts for no host."""
+    """The migration is listed with the reason and counts for no host."""
     facts = {"from": "a", "to": "b", "seconds": 1.0, "cause": "drained", "strategy": "relaunch"}
     made = report(
         (0, "assigned", "p", "a", "", {"number": 1}),

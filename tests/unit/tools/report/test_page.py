@@ -150,7 +150,7 @@ def test_processes_at_the_same_time_have_rows_of_their_own():
 
 
 def test_a_thinned_curve_keeps_its_peak_and_its_gaps():
-    """Of several points the highest is drawn; an unknown time interrupts the curve."""
+    """The highest of several points is drawn; an unknown time interrupts the curve."""
     values = [0.1] * 4000
     values[1234] = 0.97
     gap: list[float | None] = [None] * 500
