@@ -167,6 +167,27 @@ def test_sessions_find_the_children(start):
         shell.stdin.close()
 
 
+def test_an_adopted_process_has_its_descendants(start):
+    """The other processes of its session are not its own, such as the shell that started it."""
+    shell = subprocess.Popen(
+        ["sh", "-c", 'sh -c "sleep 300 & echo \\$\\$; wait" & sleep 300 & read line'],
+        start_new_session=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, bufsize=0,
+    )  # fmt: skip
+    try:
+        adopted = int(shell.stdout.readline())
+        table = SessionTable()
+        table.add(adopted)
+        wait_until(lambda: table.refresh(time.monotonic()) or len(table.pids()) == 2, "2 pids")
+        assert table.members(adopted)[0] == adopted
+        assert shell.pid not in table.pids()
+        assert table.usage()[adopted].memory > 0
+    finally:
+        os.killpg(shell.pid, 9)
+        shell.wait(10)
+        shell.stdin.close()
+        shell.stdout.close()
+
+
 def test_machine_cpu_is_what_psutil_reads(start):
     """Probe and psutil measure the same two seconds while a process is busy."""
     start(BURN)
