@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 #: Highest number of readers at the same time.
 MOST_READERS: Final = 32
-#: Changes that a reader may leave behind, about 30 s of a busy cluster; then the stream ends.
-MOST_BEHIND: Final = 64
+#: Changes that a reader may leave behind, about 25 s of a busy cluster; then the stream ends.
+MOST_BEHIND: Final = 128
 #: Seconds without a change after which a comment shows that the stream still works.
 HEARTBEAT: Final = 15.0
 #: Encoded changes; with the sequence of each, 0: it is no event.

@@ -1,0 +1,154 @@
+"""Cost of the HTTP gateway beside a master with 100 hosts and 2,000 processes.
+
+The master is real, the slaves are simulated (`benchmarks/simulated_slaves.py`), and `rosrm web` is
+the real command with one reader of `/v1/changes`:
+
+- `hosts_ms`, `processes_ms`, `metrics_ms`: median time of an answer over HTTP.
+- `update_ms`: median time from a request to the master until its event is in the stream.
+- `idle_cpu`: cores that the gateway uses while nothing changes; `pss_mib`: its memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import os
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import psutil
+
+from benchmarks.machine import parser, print_report, say
+from benchmarks.scale import Crowd
+from benchmarks.slave_cost import pss_mib
+from benchmarks.stopping import run
+from rosrm.config.settings import ClusterConfig
+from rosrm.errors import RosrmError
+from rosrm.model.values import ProcessSpec
+from rosrm.testing.local_cluster import LocalCluster
+
+#: Requests for each time of an answer.
+_REQUESTS = 10
+#: Seconds between two requests, beyond the time for which the gateway uses a listing again.
+_PAUSE = 0.3
+_PATIENCE = 60.0
+#: States of a process before its start; for the gateway only the number of rows matters.
+_BEFORE = frozenset({"queued", "assigned", "starting"})
+
+
+@contextmanager
+def gateway(cluster: LocalCluster) -> Iterator[tuple[psutil.Process, int]]:
+    """Yield the process and the port of a gateway for a cluster."""
+    with subprocess.Popen(
+        [sys.executable, "-m", "rosrm.cli", "web", "--listen", "127.0.0.1:0"], text=True,
+        env={**os.environ, **cluster.ros.environment()}, stdout=subprocess.PIPE,
+    ) as process:  # fmt: skip
+        try:
+            assert process.stdout is not None
+            lines = (line for line in process.stdout if line.startswith("rosrm web: "))
+            address = urlsplit(next(lines).split()[2].rstrip(";"))
+            yield psutil.Process(process.pid), int(address.port or 0)
+        finally:
+            process.send_signal(signal.SIGINT)
+
+
+def answer_ms(port: int, path: str) -> float:
+    """Return the median time of an answer.
+
+    Raises:
+        RosrmError: the answer is an error.
+    """
+    took = []
+    for _ in range(_REQUESTS):
+        time.sleep(_PAUSE)
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_PATIENCE)
+        begun = time.monotonic()
+        connection.request("GET", path)
+        answer = connection.getresponse()
+        content = answer.read()
+        took.append(1e3 * (time.monotonic() - begun))
+        connection.close()
+        if answer.status != 200:
+            raise RosrmError(f"{path}: {answer.status}: {content[:300]!r}")
+    return statistics.median(took)
+
+
+def update_ms(cluster: LocalCluster, stream: http.client.HTTPResponse) -> float:
+    """Return the median time from a request until its event is in the stream."""
+    took = []
+    for number in range(_REQUESTS):
+        host = f"sim{number + 1:05d}"
+        begun = time.monotonic()
+        cluster.client.set_host_state(host, "cordon")
+        while b'"host_cordoned"' not in stream.readline():
+            pass
+        took.append(1e3 * (time.monotonic() - begun))
+        cluster.client.set_host_state(host, "uncordon")
+    return statistics.median(took)
+
+
+def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
+    """Return all figures of one run; raises `RosrmError` if a part ends or does not answer."""
+    with ExitStack() as opened:
+        cluster = LocalCluster(folder, ClusterConfig())
+        opened.callback(cluster.close)
+        assert cluster.domain is not None
+        cluster.start_master()
+        cluster.client.list()
+        crowd = Crowd(cluster.domain, 10.0, 0.0, _PATIENCE)
+        opened.callback(crowd.close)
+        crowd.start(arguments.hosts, 1)
+        names = [f"process_{number}" for number in range(arguments.processes)]
+        cluster.client.submit([ProcessSpec(name, command=("true",)) for name in names])
+        cluster.wait_until(
+            f"{len(names)} processes are placed",
+            lambda view: not any(row.state in _BEFORE for row in view.processes),
+            _PATIENCE,
+        )
+        say(f"{arguments.hosts} hosts, {len(names)} processes")
+        process, port = opened.enter_context(gateway(cluster))
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_PATIENCE)
+        opened.callback(connection.close)
+        connection.request("GET", "/v1/changes")
+        stream = connection.getresponse()
+        figures = {
+            "hosts_ms": answer_ms(port, "/v1/hosts"),
+            "processes_ms": answer_ms(port, "/v1/processes"),
+            "metrics_ms": answer_ms(port, "/metrics"),
+            "update_ms": update_ms(cluster, stream),
+        }
+        before, begun = sum(process.cpu_times()[:2]), time.monotonic()
+        time.sleep(arguments.seconds)
+        used = sum(process.cpu_times()[:2]) - before
+        return {
+            **figures,
+            "idle_cpu": used / (time.monotonic() - begun),
+            "pss_mib": pss_mib([process]),
+        }
+
+
+def main() -> int:
+    """Measure and print one JSON object; return the exit status."""
+    command_line = parser(__doc__)
+    command_line.add_argument("--hosts", type=int, default=100, help="number of simulated slaves")
+    command_line.add_argument("--processes", type=int, default=2000, help="number of processes")
+    command_line.add_argument(
+        "--seconds", type=float, default=30.0, help="seconds for `idle_cpu`"
+    )  # fmt: skip
+    arguments = command_line.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        figures = measure(arguments, Path(folder))
+    print_report("web", {**vars(arguments), **figures}, runs=1)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run("web", main))
