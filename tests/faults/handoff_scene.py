@@ -19,6 +19,9 @@ COUNT = "benchmarks.handoff_nodes"
 RATE = 50.0
 #: Consecutive outputs of one instance after which that instance counts as the active one.
 _ALONE = 10
+#: Seconds for one active instance. On a busy machine a step may take its whole `ready_timeout`,
+#: 30 s, before the migration is undone.
+_SETTLED = 2 * PATIENCE
 _OTHER = {"h0": "h1", "h1": "h0"}
 
 
@@ -93,7 +96,7 @@ class Scene:
 
     def settle(self) -> ProcessRow:
         """Wait until exactly one instance runs, owns the name, publishes, and answers inputs."""
-        self.cluster.wait(NAME, "running")
+        self.cluster.wait(NAME, "running", timeout=_SETTLED)
         # An older output may be from an instance that is silent by now.
         before = len(self.watcher.outputs)
 
@@ -104,7 +107,7 @@ class Scene:
             alone = instances(self.cluster, NAME).keys() == {row.number}
             return row.state == "running" and heard and alone and bool(answered_by(last))
 
-        view = self.cluster.wait_until("one active instance", settled, PATIENCE)
+        view = self.cluster.wait_until("one active instance", settled, _SETTLED)
         return next(row for row in view.processes if row.name == NAME)
 
     def end(self, *victims: str) -> str:
