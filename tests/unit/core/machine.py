@@ -258,6 +258,7 @@ class Machine(Host[Program]):
         self.status_batches.clear()
         self.ordered.clear()
         self.polled.clear()
+        memos = self._memos()  # of the former run
         self.slave = SlaveState(max_processes=self.max_processes)
         found = (*self.ends.values(), *self._running())
-        reducer.step(self.slave, events.SupervisorReplaced(found, self._memos()), now)
+        reducer.step(self.slave, events.SupervisorReplaced(found, memos), now)
