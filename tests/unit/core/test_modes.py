@@ -179,6 +179,25 @@ def test_a_mode_whose_process_finds_no_room_for_long_is_left_again() -> None:
     assert "docked is not reached, and exploring returns: charger finds no host: " in failed
 
 
+def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
+    """The new mode stops a process, whose room ends the wait of another one."""
+    waiting = target("nav", process("planner", 8_000, host_loss=HostLossPolicy("elsewhere")))
+    large = target("map", process("mapper", 8_000))
+    cluster = in_mode(
+        "exploring", Mode("exploring", (waiting, large)), Mode("docked", (waiting,)),
+        cluster=Cluster("a", "b", progress_deadline=20.0),
+    )  # fmt: skip
+    cluster.cut(*cluster.where("planner"))
+    cluster.wait(60.0)
+    assert cluster.phase("planner") == "queued"
+    (host,) = cluster.where("mapper")
+    cluster.machines[host].stubborn.add("mapper")
+    assert switch(cluster, "docked").accepted
+    cluster.let_go("mapper", host)
+    cluster.wait(3.0)
+    assert states(cluster) == {"exploring": "", "docked": "in force"}
+
+
 def test_a_new_version_that_fails_ends_the_switch() -> None:
     """The application returns to its former version, and the cluster to its former mode."""
     worse = target("nav", new(movable("planner")), process("driver"), healthy_for=3.0)

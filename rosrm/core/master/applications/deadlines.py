@@ -63,9 +63,9 @@ def is_set_aside_for_good(
     return bool(settings.progress_deadline) and now - process.since >= settings.lease
 
 
-def has_waited_too_long(state: MasterState, process: Process, now: float) -> bool:
-    """Return True if the wait of a process for a host is longer than it may be."""
+def has_waited_too_long(state: MasterState, process: Process, since: float, now: float) -> bool:
+    """Return True if the wait of a process for a host since a time is longer than it may be."""
     deadline = state.settings.progress_deadline
     if not deadline or process.spec.kind is Kind.JOB or not awaits_host(state, process):
         return False
-    return now - process.since >= deadline
+    return now - max(process.since, since) >= deadline

@@ -134,7 +134,7 @@ def _switch(
     message, actions = applications.execute(state, targets, by, now)
     if mode.name != modes.wanted:
         modes.former = "" if returns else modes.wanted
-    modes.wanted, modes.switching = mode.name, True
+    modes.wanted, modes.switching, modes.began = mode.name, True, now
     names = [target.application for target in targets]
     modes.versions = {name: state.applications[name].wanted for name in names}
     if not returns:
@@ -190,7 +190,7 @@ def _faults(state: MasterState, mode: Mode, now: float) -> Iterator[str]:
             known = state.processes.get(process)
             if known is not None and known.phase is ProcessPhase.FAILED:
                 yield f"{process} has failed: {known.reason}"
-            elif known is not None and has_waited_too_long(state, known, now):
+            elif known is not None and has_waited_too_long(state, known, state.modes.began, now):
                 yield f"{process} finds no host: {known.reason}"
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import inf
 from typing import Any, Final
 
 from rosrm.model.codec import fields_from_plain, fields_to_plain, from_plain, to_plain
@@ -22,6 +23,7 @@ class Modes:
         former: name of the mode to which a switch that fails returns; "": none.
         versions: application of the wanted mode to the number of its version, during a switch.
         switching: the applications of the wanted mode are not as desired yet.
+        began: start of the switch by this master's clock; -inf: before this master started.
         fault: mode to the reason why it was left or not reached.
         met: modes whose condition holds; it puts a mode into force only when it begins to hold.
     """
@@ -32,6 +34,7 @@ class Modes:
     former: str = ""
     versions: dict[str, int] = field(default_factory=dict)
     switching: bool = False
+    began: float = -inf
     fault: dict[str, str] = field(default_factory=dict)
     met: list[str] = field(default_factory=list)
 
