@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import importlib.util
 import os
 import shutil
@@ -49,6 +50,8 @@ def run_compiler(*arguments: str) -> None:
 def library_in(folder: Path) -> Path:
     """Return the library, compiled in a folder."""
     path = folder / "libcore.so"
+    if path.exists():
+        return path
     sources = [str(Path(__file__).with_name("bridge.cpp"))]
     sources += sorted(str(one) for one in (PACKAGE / "src/core").glob("*.cpp"))
     run_compiler("-O1", "-shared", "-Wl,-z,lazy", "-o", str(path), *sources)
@@ -60,7 +63,12 @@ def cpp_core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the compiled core."""
     if compiler() is None:
         pytest.skip("no C++ compiler here")
-    return library_in(tmp_path_factory.mktemp("cpp_core"))
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cpp_core"
+    folder.mkdir(exist_ok=True)
+    with (folder / "lock").open("w") as lock:  # the first worker compiles for all
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        return library_in(folder)
 
 
 @cache
