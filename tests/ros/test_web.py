@@ -102,7 +102,8 @@ def test_changes_are_streamed_as_they_happen(cluster, web):
         assert next(changes).kind == "master"
         cluster.run(job("short", "true"))
         seen = list(itertools.takewhile(lambda one: one.data["kind"] != "finished", changes))
-    assert [one.data["kind"] for one in seen][:2] == ["submitted", "assigned"]
+    ours = [one.data["kind"] for one in seen if one.data.get("process") == "short"]
+    assert ours[:2] == ["submitted", "assigned"]
     assert sorted({one.number for one in seen}) == [one.number for one in seen]
 
     with web.follow(**{"Last-Event-ID": str(seen[0].number)}) as again:
@@ -113,19 +114,20 @@ def test_changes_are_streamed_as_they_happen(cluster, web):
 def test_too_many_readers_of_changes_are_refused(web):
     """The next one gets a sentence, and a place is free when a reader has left."""
     with ExitStack() as stack:
+
+        def follow_one_more() -> bool:
+            try:  # the readers of former tests may not have left yet
+                return next(stack.enter_context(web.follow())).kind == "master"
+            except AssertionError:
+                return False
+
         for _ in range(MOST_READERS):
-            next(stack.enter_context(web.follow()))
+            wait_until(follow_one_more, "a place for a reader")
         answer = web.ask("/v1/changes")
         assert (answer.status, "readers" in answer.json["detail"]) == (503, True)
 
-    def follow() -> bool:
-        try:
-            with web.follow() as changes:
-                return next(changes).kind == "master"
-        except AssertionError:
-            return False
-
-    wait_until(follow, "a place for a reader is free again")
+    with ExitStack() as stack:
+        wait_until(follow_one_more, "a place for a reader is free again")
 
 
 def test_the_gateway_says_that_the_master_is_lost_and_finds_the_next_one(make_cluster):
