@@ -209,11 +209,19 @@ def descendants(pid: int) -> list[int]:
 def _children_of(pid: int) -> list[int]:
     """Return the pids of the children of all threads of a process; [] if it has ended."""
     found: list[bytes] = []
-    with contextlib.suppress(OSError):
-        for thread in os.listdir(f"/proc/{pid}/task"):
-            with open(f"/proc/{pid}/task/{thread}/children", "rb") as file:
-                found += file.read().split()
+    for thread in _threads_of(pid):
+        children = f"/proc/{pid}/task/{thread}/children"
+        with contextlib.suppress(OSError), open(children, "rb") as file:  # it may have ended
+            found += file.read().split()
     return [int(child) for child in found]
+
+
+def _threads_of(pid: int) -> list[str]:
+    """Return the ids of the threads of a process; [] if it has ended."""
+    try:
+        return os.listdir(f"/proc/{pid}/task")
+    except OSError:
+        return []
 
 
 def command_line(pid: int) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import selectors
 import signal
 import subprocess
@@ -98,3 +99,16 @@ def test_strays_beyond_the_descriptors_are_found_when_a_watched_one_ends(tmp_pat
         ((key, _),) = its._selector.select(5.0)
         key.data()
     assert happened == [SessionEnded(TALKER)]
+
+
+def test_a_thread_that_ends_meanwhile_hides_no_children_of_the_others(monkeypatch):
+    """An adopted process may have many threads; a child that is not found would outlive it."""
+    listed = os.listdir
+    ended = str(2**22 + 1)  # above the largest pid of the kernel
+    monkeypatch.setattr(os, "listdir", lambda path: [ended, *listed(path)])
+    child = subprocess.Popen(["sleep", "100"])
+    try:
+        assert child.pid in procfs.descendants(os.getpid())
+    finally:
+        child.kill()
+        child.wait()
