@@ -22,7 +22,7 @@ from rosrm.node.identity import made_for
 
 #: Makes a node by the name of its component and its command line; raises what the component raises.
 Make = Callable[[str, Sequence[str]], Node]
-#: Seconds between two tries for the address of a container that ends.
+#: Seconds between two tries for the address of a container that ends, or for a link.
 _RETRY: Final = 0.2
 #: Seconds after the end of a process in which its node must be destroyed: another instance may be
 #: active elsewhere, because the process was fenced.
@@ -65,8 +65,17 @@ class ComponentLinks:
                 time.sleep(_RETRY)
             listening.listen()
             while True:
-                connection, _ = listening.accept()
-                threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+                self._accept(listening)
+
+    def _accept(self, listening: socket.socket) -> None:
+        """Serve the next link; without a free descriptor it waits for one."""
+        try:
+            connection, _ = listening.accept()
+        except OSError as error:
+            self._log.error(f"a component cannot be loaded now: {error.strerror}")
+            time.sleep(_RETRY)
+            return
+        threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
 
     def _serve(self, connection: socket.socket) -> None:
         """Make the node of a process, and destroy it when the process asks for that or ends."""

@@ -1,0 +1,57 @@
+"""Links of a container to components that are processes."""
+
+from __future__ import annotations
+
+import os
+import resource
+import socket
+import threading
+from types import SimpleNamespace
+
+from rosrm.component import link
+from rosrm.node.component_links import ComponentLinks
+
+
+def connected(name: str) -> socket.socket:
+    """Return a connection to a container, which may begin to listen later."""
+    connection = socket.socket(socket.AF_UNIX)
+    connection.settimeout(20.0)
+    listens = threading.Event()
+    for _ in range(400):
+        try:
+            connection.connect(link.address(name, os.environ))
+        except ConnectionRefusedError:
+            listens.wait(0.05)
+        else:
+            return connection
+    raise AssertionError(f"{name} did not listen within 20 s")
+
+
+def is_closed_by_container(connection: socket.socket) -> bool:
+    """Send what is no request, and return True if the container closes the link."""
+    with connection:
+        connection.sendall(b"no request\n")
+        return not connection.recv(1)
+
+
+def lowest_free_descriptor() -> int:
+    descriptor = os.open(os.devnull, os.O_RDONLY)
+    os.close(descriptor)
+    return descriptor
+
+
+def test_a_container_without_a_free_descriptor_takes_links_again_later(tmp_path):
+    """Its nodes have many files; a component that comes at a bad moment is not the last one."""
+    name, failed = str(tmp_path), threading.Event()
+    log = SimpleNamespace(error=lambda _: failed.set())
+    ComponentLinks(name, executor=None, make=lambda *_: None, log=log)
+    assert is_closed_by_container(connected(name))
+    with socket.socket(socket.AF_UNIX) as early:
+        soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free_descriptor(), hard))
+        try:
+            early.connect(link.address(name, os.environ))
+            assert failed.wait(20.0), "no failure of the container within 20 s"
+        finally:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    assert is_closed_by_container(connected(name))
