@@ -274,13 +274,18 @@ class ProcessTrees:
         """Send a signal to the process group of a leader.
 
         The group of an adopted process may have others, such as the script that started it. So the
-        signal goes to the process alone, and its descendants are watched as strays.
+        signal goes to the process alone, and its descendants are watched as strays. Its parent may
+        have reaped it, and its pid may be that of another process.
         """
         if key not in self._in_foreign_session:
             _send(os.killpg, leader, number, f"the group {leader}")
             return
         self.watch_strays(key, _below(leader))
-        _send(os.kill, leader, number, str(leader))
+        pidfd = self._taken_over[leader]
+        if pidfd == _NO_PIDFD:
+            _send(os.kill, leader, number, str(leader))
+        else:
+            _send(signal.pidfd_send_signal, pidfd, number, str(leader))
 
     def kill(self, found: Iterable[Stat]) -> None:
         """Send SIGKILL to processes that belong to no instance any more."""

@@ -112,3 +112,22 @@ def test_a_thread_that_ends_meanwhile_hides_no_children_of_the_others(monkeypatc
     finally:
         child.kill()
         child.wait()
+
+
+def test_a_signal_reaches_an_adopted_process_and_no_other_with_its_pid(tmp_path, monkeypatch):
+    """Its parent may reap it at any time, so a signal to the pid could end another process."""
+    by_pid: list[int] = []
+    its = trees(str(tmp_path), [])
+    adopted = subprocess.Popen(["sleep", "100"])
+    try:
+        stat = procfs.read_stat(adopted.pid)
+        assert stat is not None
+        assert its.take_over(TALKER, stat)
+        with monkeypatch.context() as patched:
+            patched.setattr(os, "kill", lambda pid, _: by_pid.append(pid))
+            its.signal(TALKER, signal.SIGTERM)
+        assert by_pid == []
+        assert adopted.wait(timeout=20.0) == -signal.SIGTERM
+    finally:
+        adopted.kill()
+        adopted.wait()
