@@ -63,7 +63,7 @@ def _connected(container: str) -> socket.socket | None:
 
 
 def _follow(connection: socket.socket, plugin: str, arguments: list[str]) -> str:
-    """Have the node made, and wait for its end; return why it cannot be made."""
+    """Request the node, and wait for its end; return why the container cannot create it."""
     if not link.is_own(connection):
         return "the container belongs to another user"
     environment = {name: value for name, value in os.environ.items() if name.startswith("ROSRM_")}

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-#: Variables that tell the containers of one machine apart: cluster, host and ROS domain.
+#: Variables that distinguish the containers of one machine: cluster, host and ROS domain.
 _PLACE: Final = ("ROSRM_MASTER", "ROSRM_HOST", "ROS_DOMAIN_ID")
 #: Most bytes of a line; a parameter file is passed by its path.
 _LONGEST: Final = 1 << 20
@@ -71,7 +71,7 @@ def show_container(pid: int) -> None:
 
 
 def container_of(pid: int, proc: str = "/proc") -> int | None:
-    """Return the process in which the node of a component's process runs; None: in itself."""
+    """Return the pid of the container that runs a process's node; None: the process itself does."""
     try:
         name = Path(proc, str(pid), "comm").read_text(encoding="ascii").strip()
     except (OSError, ValueError):  # it has ended, or has another name

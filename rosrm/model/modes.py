@@ -71,7 +71,7 @@ class ModeRow:
             cluster.
         when: condition that puts it into force; "": none.
         reason: why it was left, or not reached, when this was tried last; or which of its
-            applications have changed since it is in force.
+            applications have changed since it came into force.
         digest: digest of its contents; another one: the mode was loaded with other contents since.
     """
 

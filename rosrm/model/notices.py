@@ -17,7 +17,7 @@ NoticeLevel = Literal["INFO", "WARN", "ERROR"]
 
 @dataclass(frozen=True, slots=True)
 class Notice:
-    """An event of the cluster, or the begin or end of an alert.
+    """An event of the cluster, or the beginning or end of an alert.
 
     Attributes:
         id: unique text; a notice that is sent again after a failure keeps it.

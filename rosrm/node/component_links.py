@@ -22,7 +22,7 @@ from rosrm.node.identity import made_for
 
 #: Makes a node by the name of its component and its command line; raises what the component raises.
 Make = Callable[[str, Sequence[str]], Node]
-#: Seconds between two tries for the address of a container that ends, or for a link.
+#: Seconds between two attempts to bind the address, or to accept a link.
 _RETRY: Final = 0.2
 #: Seconds after the end of a process in which its node must be destroyed: another instance may be
 #: active elsewhere, because the process was fenced.
@@ -54,7 +54,7 @@ class ComponentLinks:
             node.destroy_node()
 
     def _listen(self) -> None:
-        """Accept links; the address is taken as long as a container of the name ends."""
+        """Accept links, once an earlier container of the same name has released the address."""
         where = link.address(self._name, os.environ)
         with socket.socket(socket.AF_UNIX) as listening:
             while not _is_bound(listening, where):
@@ -117,7 +117,7 @@ class ComponentLinks:
         node.destroy_node()
 
     def _run(self, work: Callable[[], None]) -> str:
-        """Have the executor do some work; return what it raised, "": nothing."""
+        """Run a function in the executor; return the error that it raised, "": none."""
         done = threading.Event()
         faults: list[str] = []
 

@@ -91,8 +91,8 @@ class SessionTable:
     def known_as(self, leader: int) -> tuple[int, ...]:
         """Return `members` with further pids that Fast DDS writes into the names of endpoints.
 
-        Below a launcher's program these are their pids as they see them; of a component's process
-        that of its container.
+        For members below a launcher's program, these are their pids in their own pid namespace. For
+        the process of a component, this is the pid of its container.
         """
         members = self.members(leader)
         container = container_of(leader, self._proc)

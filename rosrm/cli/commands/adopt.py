@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 
 def adopt(
     ctx: typer.Context,
-    pid: Annotated[int, typer.Argument(metavar="PID", help="Process id on this machine.")],
+    pid: Annotated[
+        int, typer.Argument(metavar="PID", help="Process id on this machine, e.g. 4711.")
+    ],
     name: Annotated[
-        str, typer.Option("--name", metavar="NAME", help="Name that the process gets.")
+        str, typer.Option("--name", metavar="NAME", help="Name in rosrm, e.g. talker.")
     ],
     host: Annotated[
         str,

@@ -39,7 +39,7 @@ def check_adoption(state: MasterState, adoption: Adoption, now: float) -> None:
 
 
 def is_pending(process: Process) -> bool:
-    """Return True for a process that is to be adopted, and does not run as its own yet."""
+    """Return True if the slave has not reported the success or failure of an adoption yet."""
     return process.spec.adoption != NO_ADOPTION
 
 

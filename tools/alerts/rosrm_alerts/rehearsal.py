@@ -27,7 +27,7 @@ class Step:
     """Changes of the cluster at one time.
 
     Attributes:
-        at: seconds from the begin of the test.
+        at: seconds since the start of the test.
         master: True: the master answers from now on; False: it does not; None: unchanged.
     """
 
@@ -40,7 +40,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """The begin or end of an alert at one time.
+    """The beginning or end of an alert at one time.
 
     Attributes:
         about: host or process; "": the cluster.

@@ -28,7 +28,7 @@ from rosrm_alerts.file_forms import Forwarded
 from rosrm_alerts.outbox import Outbox
 from rosrm_alerts.watch import Change, Watch
 
-#: Seconds between two looks at the cluster.
+#: Seconds between two listings of the cluster.
 PERIOD: Final = 1.0
 #: Seconds for the last deliveries at the end.
 CLOSING: Final = 5.0
@@ -39,7 +39,7 @@ _log = logging.getLogger("rosrm.alerts")
 
 
 class AlertService:
-    """Looks at the cluster once a second until it is stopped.
+    """Lists the cluster once a second until it is stopped.
 
     Args:
         file: checked contents of alerts.yaml.
@@ -113,7 +113,7 @@ class AlertService:
         return listing
 
     def _new(self, listing: Listing) -> Sequence[EventRow]:
-        """Return the events that have not been seen; none in the first look of all.
+        """Return the events that have not been seen; none at the very first listing.
 
         A sequence below the position belongs to a new journal, whose events are all new.
         """

@@ -1,4 +1,4 @@
-"""Begin and end of alerts. Pure: times are arguments.
+"""Beginning and end of alerts. Pure: times are arguments.
 
 =========  ==================================================  =============================
 state      observation                                         consequence

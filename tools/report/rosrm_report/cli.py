@@ -23,10 +23,15 @@ def report(
     ],
     output: Annotated[
         Path,
-        typer.Option("--output", "-o", metavar="FILE", help="File to write; an older is replaced."),
+        typer.Option(
+            "--output", "-o", metavar="FILE", help="HTML file to write; replaces an older one."
+        ),
     ] = Path("report.html"),
     title: Annotated[
-        str, typer.Option("--title", metavar="TEXT", help="Title; default: the source.")
+        str,
+        typer.Option(
+            "--title", metavar="TEXT", help="Title of the page; default: name of the source."
+        ),
     ] = "",
     as_json: AsJson = False,
 ) -> None:

@@ -22,7 +22,7 @@ from rosrm_report.model import (
     Report,
 )
 
-#: Largest distance of two scores that are nearly the same, part of the larger one.
+#: Largest difference between two nearly equal scores, as a fraction of the larger one.
 _CLOSE: Final = 0.1
 #: Unix time after which no event can be, in the year 9999.
 _LATEST: Final = 2.5e11

@@ -50,7 +50,7 @@ class Histories:
 
 @dataclass(slots=True)
 class _Process:
-    """The present of one process."""
+    """Current placement, wait and start of one process."""
 
     host: str = ""
     since: float = 0.0

@@ -95,5 +95,5 @@ def create_app(gateway: Gateway, settings: Settings) -> FastAPI:
 
 
 async def _unknown_path() -> None:
-    """Answer programs with an error, not with a page for people."""
+    """Refuse an unknown path below /v1 as JSON; the page would answer it with HTML."""
     raise HTTPException(404)

@@ -38,17 +38,21 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     certificate: Annotated[
         Path | None,
         typer.Option(
-            "--certificate", metavar="FILE", help="PEM file: HTTPS with this certificate."
+            "--certificate", metavar="FILE", help="PEM file with the certificate chain, for HTTPS."
         ),
     ] = None,
     key: Annotated[
         Path | None,
-        typer.Option("--key", metavar="FILE", help="PEM file with its key, with mode 0600."),
+        typer.Option(
+            "--key", metavar="FILE", help="PEM file with the private key, with mode 0600."
+        ),
     ] = None,
     tokens: Annotated[
         Path | None,
         typer.Option(
-            "--tokens", metavar="FILE", help="Lines `ROLE NAME TOKEN`: nothing without a token."
+            "--tokens",
+            metavar="FILE",
+            help="File with lines `ROLE NAME TOKEN`; then every request needs a token.",
         ),
     ] = None,
     allow_actions: Annotated[
@@ -56,7 +60,10 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     ] = False,
     plain_http: Annotated[
         bool,
-        typer.Option("--plain-http", help="Allow HTTP without TLS beyond this machine."),
+        typer.Option(
+            "--plain-http",
+            help="Allow HTTP without TLS on an address that other machines can reach.",
+        ),
     ] = False,
     names: Annotated[
         list[str] | None,

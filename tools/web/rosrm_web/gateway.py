@@ -29,8 +29,8 @@ class Gateway:
         reading: listings, and the regular requests of the watcher.
         acting: requests that act, and explanations.
         logs: logs, which the slaves send.
-        watcher: knows if the master answers.
-        broadcast: passes changes to those who follow them.
+        watcher: checks regularly that the master answers.
+        broadcast: passes changes to the readers of `/v1/changes`.
     """
 
     def __init__(self, connect: Callable[[Notify], Client]) -> None:

@@ -51,7 +51,7 @@ def give_up_early(seconds: float) -> None:
 
 
 class Watcher:
-    """Asks the master for new events, and so learns if the master answers.
+    """Requests new events regularly; each answer shows that the master is up.
 
     Attributes:
         master: newest known state of the master.

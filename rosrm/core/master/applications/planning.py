@@ -112,7 +112,9 @@ def copied(state: MasterState) -> MasterState:
     memo[id(state.rankings)], memo[id(state.demands)] = {}, {}
     memo.update((id(one.history), list(one.history)) for one in state.processes.values())
     copy = deepcopy(state, memo)
-    copy.settings = replace(state.settings, progress_deadline=0.0)  # a plan shows what waits
+    copy.settings = replace(
+        state.settings, progress_deadline=0.0
+    )  # a plan shows waits, not failures
     copy.rankings_version, copy.unsaved = -1, Unjournaled()
     return copy
 

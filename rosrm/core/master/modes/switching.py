@@ -286,7 +286,7 @@ def mode_rows(state: MasterState) -> Sequence[ModeRow]:
 
 
 def _why(state: MasterState, mode: Mode) -> str:
-    """Return why a mode was left or not reached, or what was changed since it is in force."""
+    """Return why a mode was left or not reached, or what has changed since it came into force."""
     modes = state.modes
     if mode.name != modes.wanted or modes.switching or mode.name in modes.fault:
         return modes.fault.get(mode.name, "")

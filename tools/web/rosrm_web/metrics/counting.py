@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 MOST_STRATEGIES: Final = 32
 #: Highest number of processes whose waits and starts are timed at the same time.
 MOST_TIMED: Final = 10_000
-#: Label of what has none of its own.
+#: Label of strategies and kinds of events that have none of their own.
 OTHER: Final = "other"
 _BUCKETS: Final = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
 _KINDS: Final = frozenset(kind.value for kind in EventKind)

@@ -1,4 +1,4 @@
-"""Dialogs of the page: a process with its explanation and logs, a host, and what may be done."""
+"""Dialogs of the page: a process with its explanation and logs, a host, and actions on both."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Action:
 
     Attributes:
         title: text of the button.
-        warning: what it will do; asked before it is done.
+        warning: effect of the action, shown for confirmation before it begins.
         request: to the master, with the name of the process or host; returns its message.
     """
 

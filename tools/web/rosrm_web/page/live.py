@@ -1,4 +1,4 @@
-"""Regular listings of the cluster, while somebody looks at the page."""
+"""Regular listings of the cluster, while a browser shows the page."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _OPTIONS: Final = {
 }
 _BAD: Final = "['failed','lost','unreachable','stuck'].includes((x ?? '').split(',')[0])"
 _POOR: Final = "['suspect','set_aside','backoff'].includes((x ?? '').split(',')[0])"
-#: A colour and a weight, because a colour alone is not seen by everybody.
+#: A colour and a weight, because some users cannot tell these colours apart.
 _STATE: Final = {
     "field": "state",
     "headerName": "State",
