@@ -80,7 +80,7 @@ def has_relaunch(plugins: Sequence[PluginRow]) -> bool:
 
 def _program(facts: ProcessFacts) -> tuple[dict[str, Any], Sequence[str]]:
     """Return the keys that name the program, and the words after it."""
-    first, *words = facts.words
+    first, *words = facts.words or (facts.program,)
     path = _absolute(first, facts)
     if not (_PYTHON.fullmatch(path.name) and words and not words[0].startswith("-")):
         return _package_of(path, facts) or {"command": [str(path)]}, words

@@ -102,8 +102,9 @@ def test_a_module_and_its_options_stay_a_command() -> None:
 
 
 def test_a_program_that_is_not_found_by_its_word_is_the_file_that_runs() -> None:
-    """A program may set its own command line."""
+    """A program may set its own command line, or have none."""
     assert keys_of(facts("my robot: idle"))["command"] == ["/usr/bin/program"]
+    assert keys_of(facts())["command"] == ["/usr/bin/program"]
 
 
 def test_a_node_without_ros_arguments_keeps_its_names() -> None:
