@@ -235,7 +235,7 @@ def test_components_start_again_with_their_container(cluster) -> None:
 
 
 def test_a_second_container_of_a_name_on_a_host_follows_the_first(cluster) -> None:
-    """It warns, and gets the components when the first one has ended."""
+    """A second container logs a warning, and gets the components when the first has ended."""
     cluster.submit(container("first", "a", "twin"))
     cluster.wait("first", "running")
     cluster.submit(container("second", "a", "twin"))

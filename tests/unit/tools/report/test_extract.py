@@ -25,7 +25,7 @@ def test_a_process_is_on_its_host_from_its_assignment_to_its_end():
 
 
 def test_a_process_without_an_end_runs_or_waits_to_the_end_of_the_report():
-    """The run may still go on when the report is made."""
+    """The run may still continue when the report is made."""
     made = report(
         (0, "submitted", "p"), (0, "submitted", "q"), (1, "assigned", "p", "a", "", {"number": 1}),
         (5, "host_cordoned", "", "a"),

@@ -58,7 +58,7 @@ def test_a_process_shows_why_it_is_not_well_in_one_line():
 
 
 def test_problems_are_counted_by_state_hosts_first():
-    """What is well is not listed."""
+    """Hosts and processes that are well are not listed as problems."""
     hosts = [host("a"), host("b", "lost"), host("c", "lost")]
     processes = [process("p", "failed"), process("q"), process("r", "set_aside")]
 
