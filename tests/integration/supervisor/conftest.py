@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -155,7 +156,8 @@ class Host:
             if str(self.state) in command_of(pid):
                 kill(pid)
         for pid in {*self.recorded(), *self.alive()}:
-            os.kill(pid, signal.SIGKILL)
+            with contextlib.suppress(ProcessLookupError):  # it may end just now
+                os.kill(pid, signal.SIGKILL)
 
     def recorded(self) -> list[int]:
         """Return living leaders from the record: during its exec a leader shows no marks yet."""

@@ -48,8 +48,8 @@ class Live:
         """Call a function after each change, until `leave`."""
         self.on_change.append(on_change)
         if self._task is None:
-            await self._read()
             self._task = asyncio.create_task(self._run())
+            await self._read()
 
     def leave(self, on_change: Callable[[], None]) -> None:
         """End the calls of a function; without any, nothing is read."""
@@ -70,7 +70,10 @@ class Live:
             self._woken.clear()
             await self._read()
             for call in list(self.on_change):
-                call()
+                try:
+                    call()
+                except Exception:  # noqa: BLE001 - one browser must not stop the others
+                    _log.exception("the page of a browser cannot be updated")
 
     async def _read(self) -> None:
         try:

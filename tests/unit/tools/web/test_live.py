@@ -1,0 +1,67 @@
+"""The page's regular listings: for all browsers, and only while there is one."""
+
+from __future__ import annotations
+
+import asyncio
+
+from rosrm.model.rows import Listing
+from rosrm_web.gateway import Gateway
+from rosrm_web.page.live import Live
+
+
+class Master:
+    """A client of a master that is always there."""
+
+    def list(self, **_):
+        return Listing("m", 1.0, 1)
+
+    def close(self):
+        """Leave nothing."""
+
+
+async def started(master: Master) -> tuple[Gateway, Live]:
+    gateway = Gateway(lambda _: master)
+    await gateway.watcher.look()
+    return gateway, Live(gateway)
+
+
+def test_a_browser_that_cannot_be_updated_stops_no_other():
+    """Its error is logged, and the next change reaches the others."""
+
+    async def scene() -> None:
+        gateway, live = await started(Master())
+        seen, times = asyncio.Event(), 0
+
+        def broken() -> None:
+            raise RuntimeError("this browser is gone")
+
+        def well() -> None:
+            nonlocal times
+            times += 1
+            live.wake()
+            if times == 3:
+                seen.set()
+
+        await live.join(broken)
+        await live.join(well)
+        await asyncio.wait_for(seen.wait(), 30.0)
+        live.leave(broken)
+        live.leave(well)
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_nothing_is_read_while_nobody_looks():
+    """The last browser that leaves ends the requests to the master."""
+
+    async def scene() -> None:
+        gateway, live = await started(Master())
+        await live.join(lambda: None)
+        assert len(asyncio.all_tasks()) == 2
+        live.leave(live.on_change[0])
+        await asyncio.sleep(0)  # lets the cancelled task end
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+        gateway.close()
+
+    asyncio.run(scene())
