@@ -32,7 +32,8 @@ def local_host(hosts: Sequence[HostRow], wanted: str) -> HostRow:
     if not here:
         raise Refused("no host of the cluster runs on this machine, which has the process")
     if not wanted and len(here) > 1:
-        raise ConfigError(f"--host: several hosts run on this machine: {listed(here, 'or')}")
+        names = listed(sorted(here), "or")
+        raise ConfigError(f"--host: several hosts run on this machine: {names}")
     return here[wanted or next(iter(here))]
 
 
