@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.devices import Device
@@ -16,6 +16,14 @@ PluginKind = Literal[
     "probe", "scoring", "filter", "migration", "checkpoint", "launcher", "sink", "plugin"
 ]
 PluginState = Literal["selected", "available", "absent", "broken", "failing"]
+
+#: States of a `HostRow` and of a `ProcessRow`.
+HOST_STATES: Final = ("up", "suspect", "expected", "lost", "left", "detached")
+PROCESS_STATES: Final = (
+    "queued", "set_aside", "scheduled", "assigned", "starting", "running", "backoff", "stopping",
+    "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck",
+    "unknown",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

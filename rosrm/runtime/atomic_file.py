@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import os
+from typing import Final
 
 from rosrm.runtime.private_files import open_private
 
+#: Mode that `open_private` gives.
+_PRIVATE: Final = 0o600
 
-def replace(path: str, content: bytes, flags: int = 0) -> int:
+
+def replace(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> int:
     """Replace a file by a new one, and return the open descriptor of the new one.
 
     After a failure the old file is unchanged, and no part of the new content is left: it would
@@ -17,6 +21,7 @@ def replace(path: str, content: bytes, flags: int = 0) -> int:
         path: of the file; the new content is first written to a file beside it.
         content: of the new file.
         flags: further flags of its descriptor.
+        mode: of the new file.
 
     Raises:
         OSError: the file cannot be written.
@@ -24,6 +29,8 @@ def replace(path: str, content: bytes, flags: int = 0) -> int:
     new = f"{path}.new"
     file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
     try:
+        if mode != _PRIVATE:
+            os.fchmod(file, mode)
         view = memoryview(content)
         while view:
             view = view[os.write(file, view) :]

@@ -33,7 +33,7 @@ def prefix(tmp_path: Path) -> Path:
     return tmp_path / "opt"
 
 
-def facts(*words: str, directory: str = "/work", has_ros: bool = False, **variables: str):
+def facts(*words: str, directory: str = "/ws", has_ros: bool = False, **variables: str):
     """Return the facts about a process with a command line and an environment."""
     environment = {"PATH": "/usr/bin:/bin", **variables}
     return ProcessFacts(4711, 17, words, "/usr/bin/program", directory, environment, has_ros)
@@ -79,7 +79,7 @@ def test_a_file_below_another_lib_is_a_command(prefix) -> None:
     (prefix / PACKAGES / "demo").unlink()
     program = str(prefix / "lib/demo/talker")
     keys = keys_of(facts(program, AMENT_PREFIX_PATH=str(prefix)))
-    assert (keys["command"], keys["working_directory"]) == ([program], "/work")
+    assert (keys["command"], keys["working_directory"]) == ([program], "/ws")
     assert "ros" not in keys
 
 
@@ -119,12 +119,12 @@ def test_ros_arguments_become_keys() -> None:
     others = "--log-level debug --params-file p.yaml"
     parameters = "-p rate:=10 -p frame:=base -p gains:=[1.0,2.0] -- -y"
     words = f"{names} {others} {parameters}".split()
-    (spec,) = processes_of(keys_of(facts("/bin/sh", *words, directory="/work")))
+    (spec,) = processes_of(keys_of(facts("/bin/sh", *words, directory="/ws")))
     assert spec.arguments == ("-x", "-y", "--ros-args", "--log-level", "debug")
     assert (spec.node_name, spec.namespace) == ("left", "/robot")
     assert spec.remappings == {"image": "front/image"}
     assert spec.parameter_sources == (
-        ParameterSource(file="/work/p.yaml"),
+        ParameterSource(file="/ws/p.yaml"),
         ParameterSource(parameters={"rate": 10}),
         ParameterSource(parameters={"frame": "base"}),
         ParameterSource(parameters={"gains": [1.0, 2.0]}),
@@ -146,7 +146,7 @@ def test_ros_arguments_become_keys() -> None:
 )
 def test_what_no_key_can_say_stays_a_ros_argument(words) -> None:
     """All parameters stay with it, because their order decides."""
-    found = RosWords(["--ros-args", *words], "/work")
+    found = RosWords(["--ros-args", *words], "/ws")
     assert [word for word in found.arguments if word] == ["--ros-args", *words]
     assert found.keys == {}
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Final, Literal, Protocol
 
 from rosrm.config.checking import near
 from rosrm.config.process import ListOfWords
-from rosrm.core.master.state.process import ProcessPhase
 from rosrm.extensions.units import Fraction, PositiveCount, ResourceName, Seconds
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.notices import NoticeLevel
+from rosrm.model.rows import PROCESS_STATES
 from rosrm.model.values import EMPTY
 from rosrm_alerts.conditions import (
     ANY,
@@ -26,9 +26,8 @@ from rosrm_alerts.conditions import (
 )
 from rosrm_alerts.rehearsal import Expected, Rehearsal, RehearsedHost, Step
 
-#: Words for kinds of events and for states of processes.
+#: Words for kinds of events.
 EVENT_KINDS: Final = tuple(kind.value for kind in EventKind)
-STATES: Final = (*(phase.value for phase in ProcessPhase), "unknown")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +72,7 @@ class OneOf:
 
 #: Kind of an event, and state of a process.
 EventWord = Annotated[str, OneOf(EVENT_KINDS)]
-ProcessState = Annotated[str, OneOf(STATES)]
+ProcessState = Annotated[str, OneOf(PROCESS_STATES)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +242,7 @@ class StateInFile:
 
     def condition(self) -> Condition:
         """Return the condition."""
-        _check_words("state", self.state, OneOf(STATES))
+        _check_words("state", self.state, OneOf(PROCESS_STATES))
         return InState(frozenset(self.state), self.process, self.application)
 
 

@@ -5,9 +5,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,6 +16,7 @@ import typer
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, seconds_of
 from rosrm.errors import ConfigError, NoMaster
+from rosrm.runtime import atomic_file
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
@@ -90,12 +91,8 @@ def _write(content: bytes, textfile: Path | None) -> None:
     if textfile is None:
         sys.stdout.write(content.decode())
         return
-    new = textfile.with_name(f"{textfile.name}.new")  # the collector reads *.prom only
     try:
-        new.write_bytes(content)
-        new.chmod(_READABLE)
-        new.replace(textfile)
+        # The new content is in *.new at first: the collector reads *.prom only.
+        os.close(atomic_file.replace(str(textfile), content, mode=_READABLE))
     except OSError as error:
-        with suppress(OSError):
-            new.unlink()
         raise ConfigError(f"--textfile {textfile}: cannot be written: {error.strerror}") from None

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final, get_args
 
 from rosrm.model.applications import ApplicationState
+from rosrm.model.rows import HOST_STATES, PROCESS_STATES
 from rosrm_web.metrics import table
 
 if TYPE_CHECKING:
@@ -18,13 +19,6 @@ Sample = tuple["Metric", tuple[str, ...], float]
 
 #: Highest number of processes with metrics of their own.
 MOST_PROCESSES: Final = 2000
-#: States with a value even if nothing is in them, so that their series have no gaps.
-_HOST_STATES: Final = ("up", "suspect", "expected", "lost", "left", "detached")
-_PROCESS_STATES: Final = (
-    "queued", "set_aside", "scheduled", "assigned", "starting", "running", "backoff", "stopping",
-    "migrating", "checkpointed", "finished", "failed", "cancelled", "unreachable", "stuck",
-    "unknown",
-)  # fmt: skip
 _OF_LOAD: Final = {
     "turn_s": table.TURN, "write_s": table.WRITE, "cpu_s": table.MASTER_CPU,
     "oldest_reading_s": table.OLDEST, "missed": table.MISSED,
@@ -44,8 +38,9 @@ def samples(listing: Listing, seconds: float) -> Iterator[Sample]:
     yield table.TROUBLE, (), float(bool(listing.trouble))
     yield table.SEQUENCE, (), float(listing.last_sequence)
     yield table.PLUGINS, (), float(len(listing.plugins))
-    yield from _counts(table.HOSTS, _HOST_STATES, (row.state for row in listing.hosts))
-    yield from _counts(table.PROCESSES, _PROCESS_STATES, (row.state for row in listing.processes))
+    # States in which nothing is have a value, too, so that their series have no gaps.
+    yield from _counts(table.HOSTS, HOST_STATES, (row.state for row in listing.hosts))
+    yield from _counts(table.PROCESSES, PROCESS_STATES, (row.state for row in listing.processes))
     states = (row.state for row in listing.applications)
     yield from _counts(table.APPLICATIONS, get_args(ApplicationState), states)
     for host in listing.hosts:

@@ -11,10 +11,11 @@ from rosrm.wording import counted, first_line, percent, size
 
 Row = Mapping[str, Any]
 
-#: States of processes that are not well.
-_BAD_PROCESSES: Final = ("failed", "unreachable", "stuck", "set_aside", "backoff")
-#: States of hosts that are not well.
-_BAD_HOSTS: Final = ("lost", "suspect")
+#: States of hosts and of processes that are not well, the gravest first, with their styles.
+_HOST_TROUBLE: Final = {"lost": "bad", "suspect": "poor"}
+_PROCESS_TROUBLE: Final = {
+    "failed": "bad", "unreachable": "bad", "stuck": "bad", "set_aside": "poor", "backoff": "poor",
+}  # fmt: skip
 #: Resources of a host in the table of hosts, each with a column of its own.
 RESOURCES: Final = ("cpu", "memory", "disk")
 
@@ -79,6 +80,7 @@ def _host(row: HostRow) -> Row:
         "id": row.description.name,
         "host": row.description.name,
         "state": ", ".join([row.state, *marks]),
+        "style": _HOST_TROUBLE.get(row.state, ""),
         "processes": row.processes,
         **{name: _usage(one) for name, one in usages.items()},
         **{f"{name}_share": round(one.usage, 2) for name, one in usages.items()},
@@ -104,6 +106,7 @@ def _process(row: ProcessRow) -> Row:
         "application": row.application,
         "process": row.name,
         "state": row.state,
+        "style": _PROCESS_TROUBLE.get(row.state, ""),
         "host": row.host,
         "cpu": f"{row.cpu:.2f}" if row.cpu else "",
         "memory": size(row.memory) if row.memory else "",
@@ -132,8 +135,8 @@ def _event(row: EventRow) -> Row:
 def problems(listing: Listing) -> list[Problem]:
     """Return what is wrong, hosts first."""
     tables = (
-        ("hosts", _BAD_HOSTS, [row.state for row in listing.hosts], "host", "hosts"),
-        ("processes", _BAD_PROCESSES, [row.state for row in listing.processes],
+        ("hosts", _HOST_TROUBLE, [row.state for row in listing.hosts], "host", "hosts"),
+        ("processes", _PROCESS_TROUBLE, [row.state for row in listing.processes],
          "process", "processes"),
     )  # fmt: skip
     return [

@@ -18,13 +18,11 @@ _OPTIONS: Final = {
     "suppressCellFocus": False,
     "ensureDomOrder": True,
 }
-_BAD: Final = "['failed','lost','unreachable','stuck'].includes((x ?? '').split(',')[0])"
-_POOR: Final = "['suspect','set_aside','backoff'].includes((x ?? '').split(',')[0])"
 #: A colour and a weight, because some users cannot tell these colours apart.
 _STATE: Final = {
     "field": "state",
     "headerName": "State",
-    "cellClassRules": {"rosrm-bad": _BAD, "rosrm-poor": _POOR},
+    "cellClassRules": {f"rosrm-{style}": f"data.style === '{style}'" for style in ("bad", "poor")},
     "width": 130,
 }
 
