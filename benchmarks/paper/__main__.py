@@ -38,6 +38,7 @@ from benchmarks.stopping import Stopped, own_keys, raise_signals
 from rosrm.errors import RosrmError
 from rosrm_examples.errors import ExampleError
 from rosrm_lab import needs
+from rosrm_report.writing import read_report, write_page
 
 #: These need no hosts: the slaves are simulated, or share the machine with budgets.
 _WITHOUT_LAB = ("fig9", "fig11")
@@ -109,7 +110,7 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _measured(name: str, options: argparse.Namespace) -> int:
     """Measure one figure, write it, and report the outcome; return its exit status."""
-    results = [options.out / f"{name}{suffix}" for suffix in (".json", ".png")]
+    results = [options.out / f"{name}{suffix}" for suffix in (".json", ".png", ".html")]
     for old in results:  # a failed measurement must not leave the results of an earlier one
         old.unlink(missing_ok=True)
     load = os.getloadavg()[0]
@@ -134,7 +135,7 @@ def _measured(name: str, options: argparse.Namespace) -> int:
 
 
 def _report(name: str, options: argparse.Namespace, folder: Path, load: float) -> dict[str, Any]:
-    """Measure one figure, and write its numbers and its picture; return the numbers."""
+    """Measure one figure; write numbers, picture and report of its run; return the numbers."""
     module, began = importlib.import_module(f"benchmarks.paper.{name}"), time.monotonic()
     wanted = Options(folder, options.runs, tuple(options.drive), options.small, options.lab)
     result = _result(name, module, wanted)
@@ -143,6 +144,10 @@ def _report(name: str, options: argparse.Namespace, folder: Path, load: float) -
         load_before=load,
     )  # fmt: skip
     result.draw(options.out / f"{name}.png")
+    if result.source is not None:
+        write_page(
+            read_report(result.source, f"{name}: {module.CLAIM}"), options.out / f"{name}.html"
+        )
     write_report(options.out, name, report)
     return report
 

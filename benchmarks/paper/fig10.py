@@ -60,7 +60,13 @@ def measure(options: Options) -> Result:
     wrong, figures = judge(trace)
     lost = [name for name, state in last.states.items() if state not in ("running", "migrating")]
     wrong += [f"{name} is {last.states[name]} at the end" for name in lost]
-    return Result(wrong, figures, scaled(plans, faster), partial(_draw, trace, trace.moves()))
+    return Result(
+        wrong,
+        figures,
+        scaled(plans, faster),
+        partial(_draw, trace, trace.moves()),
+        source=cluster.records,
+    )
 
 
 def _growing(number: int, growth: float) -> dict[str, Any]:

@@ -49,7 +49,7 @@ def measure(options: Options) -> Result:
     figures: dict[str, Any] = json.loads(summary.read_text())
     say(f"fig11: {figures['scans_processed']} of {figures['scans_sent']} scans mapped")
     wrong = differences(figures, "full", migrations=1)
-    return Result(wrong, figures, _SCALED, partial(_draw, out / "map.png"))
+    return Result(wrong, figures, _SCALED, partial(_draw, out / "map.png"), source=out)
 
 
 def _draw(picture: Path, path: Path) -> None:

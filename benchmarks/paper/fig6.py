@@ -13,7 +13,7 @@ from benchmarks.paper import pictures
 from benchmarks.paper.judging import NOISE, not_to_emptiest, over, room_left, widest_gap
 from benchmarks.paper.labs import LabCluster
 from benchmarks.paper.report import Options, Result
-from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, cluster_settings, holder
+from benchmarks.paper.settings import HOLDER_MB, MEMORY_LIMIT, alike, holder
 from benchmarks.paper.simulated import agreement
 from benchmarks.paper.trace import Trace, per_host
 from rosrm_lab import GIB, MIB, HostPlan, uniform
@@ -52,9 +52,7 @@ def measure(options: Options) -> Result:
     """Fill three hosts."""
     plans = hosts(small=options.small)
     chosen = sizes(plans[0].memory or GIB)
-    records = options.folder / "records"
-    settings = cluster_settings(record={"directory": str(records)})
-    with LabCluster(f"{options.lab}-fig6", plans, options.folder, settings) as cluster:
+    with LabCluster(f"{options.lab}-fig6", plans, options.folder) as cluster:
         for plan in plans:
             cluster.start_slave(plan.name)
         cluster.wait_for_slaves([plan.name for plan in plans])
@@ -66,10 +64,10 @@ def measure(options: Options) -> Result:
         trace = cluster.trace
     needs = {name: (mb + HOLDER_MB) * 1e6 for name, mb in named(chosen).items()}
     wrong, figures = judge(trace, needs)
-    figures["simulation"] = simulation = agreement(records)
+    figures["simulation"] = simulation = agreement(cluster.records)
     wrong += replayed_otherwise(simulation)
     scaled = {"hosts": f"{alike(plans)}; the paper: three of 16 GB", **_SCALED}
-    return Result(wrong, figures, scaled, partial(_draw, trace))
+    return Result(wrong, figures, scaled, partial(_draw, trace), source=cluster.records)
 
 
 def replayed_otherwise(simulation: Mapping[str, Any]) -> list[str]:

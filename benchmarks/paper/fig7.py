@@ -57,7 +57,7 @@ def measure(options: Options) -> Result:
         "processes": f"plain processes of {_MB} MB, one submitted every {_EVERY:g} s",
         "joins": f"at {' and '.join(f'{at:g}' for at in joins)} s",
     }
-    return Result(wrong, figures, scaled, partial(_draw, trace, joins))
+    return Result(wrong, figures, scaled, partial(_draw, trace, joins), source=cluster.records)
 
 
 def judge(trace: Trace, joins: Sequence[float]) -> tuple[list[str], dict[str, Any]]:

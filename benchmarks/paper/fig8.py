@@ -52,7 +52,9 @@ def measure(options: Options) -> Result:
     fit = line(numbers, held)
     wrong, figures = judge(trace, held, fit)
     scaled = {"hosts": f"{alike(plans)}; the paper: ten of 4 GB", **_SCALED}
-    return Result(wrong, figures, scaled, partial(_draw, numbers, held, fit))
+    return Result(
+        wrong, figures, scaled, partial(_draw, numbers, held, fit), source=cluster.records
+    )
 
 
 def _settled(trace: Trace, newest: str, look: Look) -> bool:

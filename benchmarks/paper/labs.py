@@ -70,10 +70,13 @@ class Part:
 class LabCluster:
     """A master on a desk without a quota, and hosts on which slaves are started; removed at exit.
 
+    Attributes:
+        records: folder with the record of the run, complete once the master has stopped.
+
     Args:
         name: of the lab.
         hosts: in addition to the desk.
-        folder: for settings and logs.
+        folder: for settings, logs and the record.
         cluster: the master's `cluster.yaml`; None: with the paper's settings.
     """
 
@@ -87,7 +90,9 @@ class LabCluster:
         self.lab: Final = Lab(name, [*hosts, HostPlan(DESK, disk=64 * MIB)])
         self.trace = Trace()
         self._folder = folder
-        self._settings = cluster_settings() if cluster is None else cluster
+        self.records: Final = folder / "records"
+        settings = cluster_settings() if cluster is None else cluster
+        self._settings = {**settings, "record": {"directory": str(self.records)}}
         self._parts: list[Part] = []
         self._works = 0
         self._opened = ExitStack()
@@ -109,7 +114,11 @@ class LabCluster:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._opened.close()
+        try:
+            if error is None:
+                self.stop_master()
+        finally:
+            self._opened.close()
 
     # --- parts --------------------------------------------------------------------------------
 
@@ -145,8 +154,10 @@ class LabCluster:
         self.wait_until(f"slaves of {', '.join(hosts)} requesting work", asking, _START)
 
     def stop_master(self) -> None:
-        """Shut down the master."""
-        master = next(part for part in self._parts if part.name == "master")
+        """Shut down the master if it runs."""
+        master = next((part for part in self._parts if part.name == "master"), None)
+        if master is None:
+            return
         self._parts.remove(master)
         master.process.send_signal(signal.SIGINT)
         try:

@@ -27,7 +27,12 @@ def combined(results: Sequence[Result], names: Sequence[str]) -> Result:
     ]
     spread = {name: _spread([one.figures[name] for one in results]) for name in names}
     return Result(
-        wrong, {**middle.figures, "spread": spread}, middle.scaled, middle.draw, len(results)
+        wrong,
+        {**middle.figures, "spread": spread},
+        middle.scaled,
+        middle.draw,
+        len(results),
+        middle.source,
     )
 
 

@@ -24,8 +24,9 @@ class Result:
         wrong: objections to the claim, as sentences; empty: it holds.
         figures: numbers, plain, by the keys of the JSON file.
         scaled: the differences from the paper's setting, with reasons.
-        runs: how often it was measured.
         draw: writes the picture to a path.
+        runs: how often it was measured.
+        source: what `rosrm report` reads, of the run that the picture shows; None: no processes.
     """
 
     wrong: list[str]
@@ -33,6 +34,7 @@ class Result:
     scaled: Mapping[str, str]
     draw: Callable[[Path], None]
     runs: int = 1
+    source: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -169,7 +169,7 @@ def measure(options: Options) -> Result:
         "piece after the other",
         "hosts": f"{alike(plans)}, for all at once must fit on its cores",
     }
-    return Result(wrong, figures, scaled, partial(_draw, figures), options.runs)
+    return Result(wrong, figures, scaled, partial(_draw, figures), options.runs, cluster.records)
 
 
 def judge(

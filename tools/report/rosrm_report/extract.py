@@ -195,7 +195,7 @@ def _host_figures(
     readings: Readings | None,
 ) -> Iterable[HostFigures]:  # fmt: skip
     assigned = Counter(event.host for _, event in timed if event.kind == EventKind.ASSIGNED)
-    moved = [move for move in histories.moves if move.done]
+    moved = [move for move in histories.moves if move.done and not move.within]
     away, to = Counter(one.source for one in moved), Counter(one.destination for one in moved)
     failed = Counter(one.host for one in failures)
     usage = readings.usage if readings is not None else {}

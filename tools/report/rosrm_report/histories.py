@@ -32,6 +32,8 @@ _RUNS: Final = frozenset(
         EventKind.MIGRATED,
     }
 )  # fmt: skip
+#: Kinds of events with which another instance begins, also on the same host.
+_BEGINS: Final = frozenset({EventKind.ASSIGNED, EventKind.MIGRATED})
 _STARTED: Final = frozenset({EventKind.RUNNING, EventKind.READY})
 _MIGRATES: Final = frozenset({EventKind.MIGRATION_BEGUN, EventKind.FAILED_OVER})
 
@@ -120,7 +122,7 @@ class _Reader:
             seconds = time - one.assigned
             self._found.starts.append(Start(event.process, event.host, one.assigned, seconds))
             one.assigned = None
-        if one.host != event.host or event.kind == EventKind.ASSIGNED:
+        if one.host != event.host or event.kind in _BEGINS:
             self._leave(one, time, event)
             one.host, one.since = event.host, time
             one.assigned = time if event.kind == EventKind.ASSIGNED else None

@@ -64,6 +64,8 @@ class Placement:
 class Move:
     """A process that changed its host, or a migration that failed.
 
+    A migration within a host, e.g. to the instance of a new version, counts as a replacement.
+
     Attributes:
         time: of its end.
         how: strategy of the migration; "restart": the process was started again elsewhere.
@@ -79,6 +81,11 @@ class Move:
     cause: str
     seconds: float | None = None
     done: bool = True
+
+    @property
+    def within(self) -> bool:
+        """Return True if both instances were on the same host."""
+        return self.source == self.destination
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ import jinja2
 from rosrm.version import __version__
 from rosrm.wording import counted, duration, sanitized
 from rosrm_report import svg
-from rosrm_report.model import Report
+from rosrm_report.model import Move, Report
 
 #: Rows of a table; the rest is only in the JSON.
 MOST_ROWS: Final = 200
@@ -73,14 +73,16 @@ def _facts(report: Report) -> Sequence[tuple[str, str]]:
     """Return the most important numbers, each with its name."""
     states = list(report.outcomes.values())
     waits = sorted(one.seconds for one in report.waits)
-    done = sum(one.done for one in report.moves)
-    rest = len(report.moves) - done
+    done = _moved(report)
+    replaced = sum(one.done and one.within for one in report.moves)
+    rest = len(report.moves) - done - replaced
     facts = [
         ("duration", duration(report.length)),
         ("hosts", str(len(report.hosts))),
         ("processes", str(len(states))),
         *((state, str(states.count(state))) for state in ("finished", "failed", "cancelled")),
         ("moves", f"{done}" + (f" and {rest} that failed" if rest else "")),
+        *([("replaced on their host", str(replaced))] if replaced else []),
         ("failures", str(len(report.failures))),
         ("longest queue", str(max((one for _, one in report.queue), default=0))),
     ]
@@ -104,7 +106,7 @@ def _tables(report: Report) -> Mapping[str, Table]:
             ("time", "process", "from", "to", "how", "duration", "cause"),
             (
                 (svg.clock(one.time), one.process, one.source,
-                 one.destination if one.done else f"stayed (to {one.destination})", one.how,
+                 _destination(one), one.how,
                  "-" if one.seconds is None else duration(one.seconds), one.cause)
                 for one in report.moves
             ), len(report.moves),
@@ -145,6 +147,17 @@ def _tables(report: Report) -> Mapping[str, Table]:
     }  # fmt: skip
 
 
+def _moved(report: Report) -> int:
+    """Return the number of processes that came to another host."""
+    return sum(one.done and not one.within for one in report.moves)
+
+
+def _destination(move: Move) -> str:
+    if not move.done:
+        return f"stayed (to {move.destination})"
+    return "the same host" if move.within else move.destination
+
+
 def _hosts(report: Report) -> Table:
     resources = sorted(report.readings.usage) if report.readings is not None else []
     heads = (
@@ -173,7 +186,7 @@ def _plain(text: str) -> str:
 
 def summary(report: Report) -> str:
     """Return the run in one line."""
-    done = sum(one.done for one in report.moves)
+    done = _moved(report)
     parts = [
         counted(len(report.outcomes), "process", "processes"), counted(len(report.hosts), "host"),
         counted(done, "move"), counted(len(report.failures), "failure"),

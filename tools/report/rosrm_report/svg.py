@@ -129,7 +129,8 @@ def timeline(
         ]
         y += height + _GAP
     content += [_span(scale, one, *bands[one.host]) for one in spans if one.host in bands]
-    content += [_arrow(scale, one, bands) for one in moves[:MOST_MARKS] if one.done]
+    arrows = [one for one in moves[:MOST_MARKS] if one.done and not one.within]
+    content += [_arrow(scale, one, bands) for one in arrows]
     content += [_cross(scale, one, bands) for one in failures[:MOST_MARKS] if one.host in bands]
     height = y + _AXIS
     drawn = sum(row < _MOST_ROWS for bars in rows.values() for row, _ in bars)

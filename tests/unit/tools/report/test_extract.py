@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from rosrm_report.extract import report_of, timed_events
 from rosrm_report.model import CloseDecision, HostSpan, Material, Move, Placement, Start, Wait
+from rosrm_report.page import page_of, summary
 from tests.unit.tools.report.runs import READINGS, decision, events, report
 
 
@@ -53,6 +54,24 @@ def test_a_migration_is_a_move_with_its_cause():
     assert [(one.host, one.moves_from, one.moves_to) for one in made.hosts] == [
         ("a", 1, 0), ("b", 0, 1),
     ]  # fmt: skip
+
+
+def test_a_migration_within_a_host_is_a_replacement():
+    """Each instance has its time there, and neither the moves nor the host's figures count it."""
+    facts = {"from": "a", "to": "a", "cause": "version 2", "strategy": "handoff", "seconds": 1}
+    made = report(
+        (0, "assigned", "p", "a", "", {"number": 1}),
+        (1, "migration_begun", "p", "a", "", {"destination": 2}),
+        (3, "migrated", "p", "a", "", facts), (9, "cancelled", "p", "a"),
+    )  # fmt: skip
+
+    assert made.placements == (
+        Placement("p", "a", 0.0, 3.0, 1, "migrated"),
+        Placement("p", "a", 3.0, 9.0, 2, "cancelled"),
+    )
+    assert made.hosts[0].moves_to == made.hosts[0].moves_from == 0
+    assert "no moves" in summary(made)
+    assert "replaced on their host" in page_of(made)
 
 
 def test_a_migration_that_failed_leaves_the_process_where_it_was():
