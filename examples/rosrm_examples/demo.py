@@ -31,12 +31,14 @@ from rosrm import ProcessRow
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,
+    REPORT_FILE,
     Stage,
     Unfit,
     demo_parser,
     free_memory,
     own_folder,
     run_demo,
+    write_report,
 )
 from rosrm_examples.demo_job import (
     HOSTS,
@@ -56,9 +58,7 @@ from rosrm_examples.demo_screen import screen_for
 from rosrm_examples.drives import Drive, drive_of
 from rosrm_examples.merge import join, write_map
 from rosrm_examples.pieces import load_pieces
-from rosrm_report.writing import read_report, write_page
 
-REPORT_FILE: Final = "report.html"
 SUMMARY_FILE: Final = "summary.json"
 #: Files that the demo writes, in the order in which a user looks at them.
 LEFT: Final = (
@@ -133,7 +133,7 @@ def _write_results(
     draw_usage(out / USAGE_FILE, record, title_of(record))
     summary = summarise(record, processes, {"drive": drive.name, **figures})
     (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n")
-    write_page(read_report(out, title_of(record)), out / REPORT_FILE)
+    write_report(out, title_of(record))
     return summary
 
 

@@ -17,10 +17,12 @@ from rich.console import Console
 from rosrm import RosrmError
 from rosrm_examples.demo_run import DemoFailed, Stopped, StopSignals
 from rosrm_examples.errors import ExampleError
+from rosrm_report.writing import read_report, write_page
 from rosrm_resources.memory import CgroupMemory
 
 #: A folder below the folder of results: states and logs of master and slaves.
 CLUSTER: Final = "cluster"
+REPORT_FILE: Final = "report.html"
 #: Mark of a folder that belongs to a demo, which may empty it.
 _MARK: Final = ".rosrm-demo"
 
@@ -99,6 +101,11 @@ def own_folder(out: Path, left: Iterable[str], folders: Iterable[str] = ()) -> T
     for name in left:
         (out / name).unlink(missing_ok=True)
     return lock
+
+
+def write_report(out: Path, title: str) -> None:
+    """Write the report of a demo from its events and samples, and from the logs of its hosts."""
+    write_page(read_report(out, title), out / REPORT_FILE)
 
 
 def free_memory() -> float:

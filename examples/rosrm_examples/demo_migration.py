@@ -38,12 +38,14 @@ from rosrm import Listing
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,
+    REPORT_FILE,
     Stage,
     Unfit,
     demo_parser,
     free_memory,
     own_folder,
     run_demo,
+    write_report,
 )
 from rosrm_examples.demo_job import MEMORY_LIMIT
 from rosrm_examples.demo_record import EVENTS_FILE, SAMPLES_FILE, Record
@@ -72,10 +74,18 @@ from rosrm_examples.slam_state import STATES
 SUMMARY_FILE: Final = "summary.json"
 MAP_FILE, TRAJECTORY_FILE, CLOUD_FILE = "map.png", "trajectory.png", "map.ply"
 #: Files that the demo writes, in the order in which a user looks at them.
-LEFT: Final = (SUMMARY_FILE, MAP_FILE, TRAJECTORY_FILE, CLOUD_FILE, EVENTS_FILE, SAMPLES_FILE)
+LEFT: Final = (
+    REPORT_FILE,
+    SUMMARY_FILE,
+    MAP_FILE,
+    TRAJECTORY_FILE,
+    CLOUD_FILE,
+    EVENTS_FILE,
+    SAMPLES_FILE,
+)
 #: A folder below the folder of results: the map of each instance of the SLAM.
 _PARTS: Final = "parts"
-_REPORT: Final = "player.json"
+_PLAYED: Final = "player.json"
 
 #: Source and destination, as in the paper's Fig. 11, and those after them.
 _COLOURS: Final = ("#2563c9", "#2f9e44", "#c98a1b", "#9c36b5")
@@ -118,10 +128,10 @@ def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
         rate=options.rate or usual_rate(drive),
         state=options.state,
         out=(out / _PARTS).absolute(),
-        report=(out / _REPORT).absolute(),
+        report=(out / _PLAYED).absolute(),
         working_directory=Path.cwd(),
     )
-    with own_folder(out, (*LEFT, _REPORT), [_PARTS]):
+    with own_folder(out, (*LEFT, _PLAYED), [_PARTS]):
         stage.console.print(_opening(live), highlight=False, soft_wrap=True)
         record = Record(HOSTS, {"memory": MEMORY_LIMIT}, BUDGET)
         run = _carry_out(live, record, out / CLUSTER, stage)
@@ -187,6 +197,7 @@ def _write_results(out: Path, run: LiveRun, record: Record) -> dict[str, Any]:
     ]
     points = np.concatenate([one.points for one in stretches])
     write_ply(out / CLOUD_FILE, points, np.concatenate(colours))
+    write_report(out, title)
     return summary
 
 

@@ -36,12 +36,14 @@ import numpy as np
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,
+    REPORT_FILE,
     Stage,
     Unfit,
     demo_parser,
     free_memory,
     own_folder,
     run_demo,
+    write_report,
 )
 from rosrm_examples.demo_job import MEMORY_LIMIT
 from rosrm_examples.demo_record import EVENTS_FILE, SAMPLES_FILE, Record
@@ -64,11 +66,11 @@ from rosrm_examples.rollout_plot import POSES_FILE, ROLLOUT_FILE, draw_rollout
 
 SUMMARY_FILE: Final = "summary.json"
 #: Files that the demo writes, in the order in which a user looks at them.
-LEFT: Final = (SUMMARY_FILE, ROLLOUT_FILE, EVENTS_FILE, SAMPLES_FILE, POSES_FILE)
+LEFT: Final = (REPORT_FILE, SUMMARY_FILE, ROLLOUT_FILE, EVENTS_FILE, SAMPLES_FILE, POSES_FILE)
 #: A drive that lasts as long as all versions need: 40 s.
 DRIVE: Final = "street:400"
 _PARTS: Final = "parts"
-_REPORT: Final = "player.json"
+_PLAYED: Final = "player.json"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -86,10 +88,10 @@ def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
     live = LiveRollout(
         drive=load_drive(options.drive or DRIVE),
         out=(out / _PARTS).absolute(),
-        report=(out / _REPORT).absolute(),
+        report=(out / _PLAYED).absolute(),
         working_directory=Path.cwd(),
     )
-    with own_folder(out, (*LEFT, _REPORT), [_PARTS]):
+    with own_folder(out, (*LEFT, _PLAYED), [_PARTS]):
         opening = f"rosrm rollout demo: {live.drive.name}, {len(live.drive)} scans"
         stage.console.print(opening, highlight=False, soft_wrap=True)
         record = Record((HOST,), {"memory": MEMORY_LIMIT}, BUDGET)
@@ -125,6 +127,7 @@ def _write_results(out: Path, run: LiveRun, record: Record) -> dict[str, Any]:
     arrived = [one.arrived for one in run.received]
     (out / POSES_FILE).write_text(json.dumps(arrived) + "\n")
     draw_rollout(out / ROLLOUT_FILE, record, arrived)
+    write_report(out, f"{run.drive.name}: three versions of an application")
     return summary
 
 

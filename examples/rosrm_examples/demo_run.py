@@ -15,6 +15,7 @@ from rosrm import Client, InstanceId, Listing, ProcessRow, RosrmError, Target
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster, Part
 from rosrm_examples.demo_job import Arrival
+from rosrm_examples.demo_page import DemoPage
 from rosrm_examples.demo_record import ENDED, Record
 from rosrm_examples.demo_screen import Screen
 
@@ -105,6 +106,7 @@ class Demo:
         self._screen = screen
         self._signals = signals
         self._cluster = cluster
+        self._page: DemoPage | None = None
 
     def carry_out(self, script: Script) -> Sequence[ProcessRow]:
         """Carry out a script; return the processes with their states at the end.
@@ -121,12 +123,15 @@ class Demo:
             self._check_parts()  # the error of a part that has died is more precise than a timeout
             raise
         finally:
+            if self._page is not None:
+                self._page.close()
             self._cluster.close()
 
     def _start_cluster(self) -> None:
         self._cluster.start_master()
         for host in self._cluster.hosts:
             self._cluster.start_slave(host)
+        self._page = DemoPage(self._cluster.ros, self._cluster.directory / "web.log")
         self._cluster.wait_until("every host accepting work", self._all_accept, _START_S)
 
     def _all_accept(self, view: Listing) -> bool:
@@ -140,6 +145,8 @@ class Demo:
         while True:
             self._signals.check()
             self._check_parts()
+            if news := self._page.news() if self._page is not None else "":
+                self._screen.say(news)
             elapsed = time.monotonic() - began
             script.act(client, elapsed)
             if elapsed >= next_look:

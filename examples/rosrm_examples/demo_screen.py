@@ -28,6 +28,9 @@ class Screen(Protocol):
     def show(self, view: Listing, elapsed: float) -> None:
         """Show a view, `elapsed` seconds after the beginning."""
 
+    def say(self, text: str) -> None:
+        """Print a line that stays."""
+
     def close(self) -> None:
         """Leave the terminal as it was."""
 
@@ -66,6 +69,10 @@ class LiveScreen:
         self._live.start()
         self._live.update(table, refresh=True)
 
+    def say(self, text: str) -> None:
+        """Print a line above the table."""
+        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+
     def close(self) -> None:
         """Remove the table."""
         self._live.stop()
@@ -83,12 +90,13 @@ class LineScreen:
         """Print new migrations, and the line when it is due."""
         for event in view.events:
             if event.kind in ("migration_begun", "over_limit"):
-                self._print(f"        {event.message}")
+                self.say(f"        {event.message}")
         if elapsed >= self._next:
             self._next = elapsed + _LINE_EVERY_S
-            self._print(f"{elapsed:5.0f} s  {self._line(view)}")
+            self.say(f"{elapsed:5.0f} s  {self._line(view)}")
 
-    def _print(self, text: str) -> None:
+    def say(self, text: str) -> None:
+        """Print a line."""
         self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
     def close(self) -> None:

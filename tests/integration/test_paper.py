@@ -40,7 +40,7 @@ def lab():
 @pytest.mark.slow
 @pytest.mark.timeout(LONGEST + 60)
 def test_a_small_figure_is_measured_and_its_claim_holds(lab, tmp_path):
-    """Numbers, picture, last line of output and exit status agree."""
+    """Numbers, picture, report, last line of output and exit status agree."""
     ended = subprocess.run(
         [*COMMAND, "fig6", "--small", "--lab", lab, "--out", str(tmp_path)],
         check=False,
@@ -56,6 +56,7 @@ def test_a_small_figure_is_measured_and_its_claim_holds(lab, tmp_path):
     assert report["processes"] == sum(report["per_host"].values()) > 3
     assert report["waiting_at_the_end"] > 0
     assert report["simulation"]["replayed_differently"] == 0
+    assert "Usage of memory" in (tmp_path / "fig6.html").read_text()
     assert (tmp_path / "fig6.png").read_bytes().startswith(b"\x89PNG")
 
 

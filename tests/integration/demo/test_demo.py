@@ -40,6 +40,7 @@ def test_a_short_demo_fills_the_hosts_maps_the_drive_and_migrates(start: Start) 
     assert summary["map_points"] > 1000
     assert 0 <= summary["end_error_percent"] < 1.5
     assert "summary.json" in output
+    assert "the page of this cluster, until the demo ends: http://127.0.0.1:" in output
 
     events = read_lines(run.out / "events.jsonl")
     assert [event["sequence"] for event in events] == sorted(event["sequence"] for event in events)

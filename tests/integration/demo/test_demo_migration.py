@@ -43,6 +43,7 @@ def test_the_slam_moves_in_mid_drive(start: Start, state: str) -> None:
     events = read_lines(run.out / "events.jsonl")
     kinds = [event["kind"] for event in events]
     assert kinds.index("over_limit") < kinds.index("migration_begun") < kinds.index("migrated")
+    assert "Processes over hosts" in (run.out / "report.html").read_text()
     for name in ("map.png", "trajectory.png"):
         assert (run.out / name).read_bytes().startswith(b"\x89PNG")
     header, _, _ = (run.out / "map.ply").read_bytes().partition(b"end_header")

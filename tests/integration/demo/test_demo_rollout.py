@@ -48,4 +48,5 @@ def test_no_scan_is_lost_while_versions_come_and_one_is_given_up(start: Start) -
     ]  # fmt: skip
     moved = [event["process"] for event in events if event["kind"] == "migrated"]
     assert moved.count(SLAM) == HANDOFFS
+    assert "replaced on their host" in (run.out / "report.html").read_text()
     assert (run.out / "rollout.png").read_bytes().startswith(b"\x89PNG")
