@@ -11,6 +11,8 @@ import pytest
 
 from tests.waiting import PATIENCE
 
+#: Seconds for one step of a page: on a busy machine a browser, a gateway and a cluster share a CPU.
+BROWSER_PATIENCE = 3 * PATIENCE
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 
 
@@ -23,7 +25,9 @@ def browser() -> Iterator[Any]:
 
     with sync_playwright() as driver:
         # Its sandbox needs a user that is not root.
-        one = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        one = driver.chromium.launch(
+            executable_path=CHROMIUM, args=["--no-sandbox"], timeout=BROWSER_PATIENCE * 1000
+        )
         try:
             yield one
         finally:
@@ -34,7 +38,7 @@ def browser() -> Iterator[Any]:
 def tab(browser: Any, url: str, **options: Any) -> Iterator[Any]:
     """Yield a tab with a page; fail if the page reports an error or asks another machine."""
     context = browser.new_context(**options)
-    context.set_default_timeout(PATIENCE * 1000)
+    context.set_default_timeout(BROWSER_PATIENCE * 1000)
     page = context.new_page()
     errors: list[str] = []
     outside: list[str] = []

@@ -19,6 +19,9 @@ from urllib.parse import urlsplit
 from rosrm.model.ros_settings import RosSettings
 from tests.waiting import PATIENCE, wait_until
 
+#: Seconds for the start of a gateway, which takes 3 s of CPU time, on a busy machine.
+START_PATIENCE = 3 * PATIENCE
+
 
 @dataclass(frozen=True)
 class Answer:
@@ -62,7 +65,12 @@ class Gateway:
         ]
         for thread in threads:
             thread.start()
-        self.url = wait_until(self._url, "rosrm web prints its address", seen=lambda: self.said)
+        self.url = ""
+
+    def wait_for_address(self) -> None:
+        self.url = wait_until(
+            self._url, "rosrm web prints its address", START_PATIENCE, seen=lambda: self.said
+        )
 
     def _url(self) -> str:
         lines = [line for line in self.said if line.startswith("rosrm web: ")]
@@ -122,7 +130,11 @@ class Gateway:
     def end(self, number: int = signal.SIGINT) -> int:
         """End the gateway with a signal; return its exit code."""
         self.process.send_signal(number)
-        return self.process.wait(PATIENCE)
+        try:
+            return self.process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            raise
 
 
 def _changes(lines: Iterable[bytes]) -> Iterator[Change]:
@@ -141,6 +153,7 @@ def gateway(ros: RosSettings, *words: str, tls: ssl.SSLContext | None = None) ->
     """Yield a gateway that ends afterwards, with success and without a traceback."""
     one = Gateway(ros, *words, tls=tls)
     try:
+        one.wait_for_address()
         yield one
     finally:
         code = one.end() if one.process.poll() is None else 0
