@@ -3,7 +3,6 @@
 sources.py    a directory, journal or record as events, readings and logs
 model.py      values of a report
 extract.py    events and readings -> report
-histories.py  events of each process -> placements, waits, starts, moves
 recorded.py   a record as events and readings
 svg.py        pictures
 page.py       report -> HTML

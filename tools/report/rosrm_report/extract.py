@@ -9,28 +9,16 @@ from typing import Final
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.notices import notice_of
 from rosrm.model.rows import EventRow
+from rosrm.timeline.processes import Histories
+from rosrm.timeline.reading import FAILS, Timeline
+from rosrm.timeline.values import Failure, HostSpan
 from rosrm.wording import counted, sanitized
-from rosrm_report.histories import Histories, histories_of, whole
-from rosrm_report.model import (
-    CloseDecision,
-    Failure,
-    Fault,
-    HostFigures,
-    HostSpan,
-    Material,
-    Readings,
-    Report,
-)
+from rosrm_report.model import CloseDecision, Fault, HostFigures, Material, Readings, Report
 
 #: Largest difference between two nearly equal scores, as a fraction of the larger one.
 _CLOSE: Final = 0.1
 #: Unix time after which no event can be, in the year 9999.
 _LATEST: Final = 2.5e11
-_FAILS: Final = frozenset({EventKind.FAILED, EventKind.BACKOFF})
-_GONE: Final = {
-    EventKind.HOST_LOST: "lost", EventKind.HOST_LEFT: "left", EventKind.HOST_DETACHED: "detached",
-}  # fmt: skip
-_BACK: Final = frozenset({EventKind.HOST_BACK, EventKind.HOST_REGISTERED})
 
 Timed = Sequence[tuple[float, EventRow]]
 
@@ -38,13 +26,14 @@ Timed = Sequence[tuple[float, EventRow]]
 def report_of(material: Material, title: str = "") -> Report:
     """Return the report of a run; the failures have no log lines yet."""
     kept = [one for one in material.events if _is_timed(one)]
-    timed = timed_events(kept)
+    timeline = Timeline()
+    timed = [(timeline.take(event), event) for event in kept]
     readings = material.readings
     ends = [time for time, _ in timed[-1:]]
     end = max([*ends, *readings.times[-1:]] if readings else ends, default=0.0)
-    histories = histories_of(timed, end)
-    failures = tuple(_failures(timed))
-    over = _over_limit(timed, end)
+    histories = timeline.processes.histories(end)
+    failures = tuple(timeline.failures)
+    over = timeline.hosts.over_limit(end)
     return Report(
         title=title or f"Run of {material.name}",
         source=material.name,
@@ -60,30 +49,12 @@ def report_of(material: Material, title: str = "") -> Report:
         close_decisions=tuple(_close_decisions(timed)),
         failures=failures,
         faults=tuple(_faults(timed)),
-        gone=_gone(timed, end),
+        gone=timeline.hosts.gone(end),
         over_limit=over,
         queue=tuple(histories.queue),
         readings=readings,
         events=len(timed),
     )  # fmt: skip
-
-
-def timed_events(events: Sequence[EventRow]) -> Timed:
-    """Return events with their seconds since the first one.
-
-    Within a run of a master its monotonic clock counts, and unix time between two runs.
-    """
-    timed: list[tuple[float, EventRow]] = []
-    offset, before = 0.0, None
-    for event in events:
-        if before is None:
-            offset = -event.elapsed
-        elif event.kind == EventKind.MASTER_STARTED or event.elapsed < before.elapsed:
-            pause = max(0.0, event.wall_time - before.wall_time)
-            offset = timed[-1][0] + pause - event.elapsed
-        timed.append((event.elapsed + offset, event))
-        before = event
-    return timed
 
 
 def _is_timed(event: EventRow) -> bool:
@@ -107,21 +78,7 @@ def _gaps(events: Sequence[EventRow], material: Material) -> Iterable[str]:
         yield "The source has no readings, so the usage of the hosts is not shown."
 
 
-# --- failures and faults ----------------------------------------------------------------------
-
-
-def _failures(timed: Timed) -> Iterable[Failure]:
-    numbers: dict[str, int] = {}
-    for time, event in timed:
-        if event.process and "number" in event.facts:
-            numbers[event.process] = whole(event, "number")
-        elif event.kind == EventKind.MIGRATION_BEGUN:
-            numbers[event.process] = whole(event, "destination")
-        if event.kind in _FAILS:
-            number = numbers.get(event.process, 0)
-            restarts = event.kind == EventKind.BACKOFF
-            message = sanitized(event.message, lines=True)
-            yield Failure(time, event.process, event.host, number, message, restarts)
+# --- faults ----------------------------------------------------------------------
 
 
 def _faults(timed: Timed) -> Iterable[Fault]:
@@ -131,37 +88,9 @@ def _faults(timed: Timed) -> Iterable[Fault]:
         if event.kind == EventKind.MASTER_STARTED:
             started += 1
             level = "WARN" if started > 1 else "INFO"
-        if level != "INFO" and event.kind not in _FAILS:
+        if level != "INFO" and event.kind not in FAILS:
             message = sanitized(event.message, lines=True)
             yield Fault(time, level, event.kind, event.host, event.process, message)
-
-
-def _gone(timed: Timed, end: float) -> tuple[HostSpan, ...]:
-    since: dict[str, tuple[float, str]] = {}
-    spans = []
-    for time, event in timed:
-        if event.kind in _GONE:
-            since.setdefault(event.host, (time, _GONE[EventKind(event.kind)]))
-        elif event.kind in _BACK and event.host in since:
-            begin, what = since.pop(event.host)
-            spans.append(HostSpan(event.host, what, begin, time))
-    spans += [HostSpan(host, what, begin, end) for host, (begin, what) in since.items()]
-    return tuple(spans)
-
-
-def _over_limit(timed: Timed, end: float) -> tuple[HostSpan, ...]:
-    since: dict[str, dict[str, float]] = {}
-    spans = []
-    for time, event in timed:
-        if event.kind == EventKind.OVER_LIMIT:
-            resource = str(event.facts.get("resource", ""))
-            since.setdefault(event.host, {}).setdefault(resource, time)
-        elif event.kind == EventKind.UNDER_LIMIT or event.kind in _GONE:
-            for resource, begin in since.pop(event.host, {}).items():
-                spans.append(HostSpan(event.host, resource, begin, time))
-    for host, resources in since.items():
-        spans += [HostSpan(host, resource, begin, end) for resource, begin in resources.items()]
-    return tuple(spans)
 
 
 # --- decisions and hosts ----------------------------------------------------------------------

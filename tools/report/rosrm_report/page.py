@@ -10,10 +10,11 @@ from typing import Any, Final
 
 import jinja2
 
+from rosrm.timeline.values import Move
 from rosrm.version import __version__
 from rosrm.wording import counted, duration, sanitized
 from rosrm_report import svg
-from rosrm_report.model import Move, Report
+from rosrm_report.model import Report
 
 #: Rows of a table; the rest is only in the JSON.
 MOST_ROWS: Final = 200

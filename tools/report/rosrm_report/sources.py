@@ -20,8 +20,9 @@ from rosrm.model.rows import EventRow
 from rosrm.model.values import InstanceId
 from rosrm.recording.frames import is_record
 from rosrm.supervisor.client import log_path
+from rosrm.timeline.values import Failure
 from rosrm.wording import counted, sanitized
-from rosrm_report.model import Failure, Material, Readings, Report
+from rosrm_report.model import Material, Readings, Report
 
 if TYPE_CHECKING:
     from rosrm_report.recorded import RecordedRun

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Final
 
+from rosrm.timeline.lanes import lanes
+from rosrm.timeline.values import Failure, HostSpan, Move, Placement
 from rosrm.wording import duration, sanitized
-from rosrm_report.model import Failure, HostSpan, Move, Placement, Readings
+from rosrm_report.model import Readings
 
 #: Number of colours in page.css.
 _COLOURS: Final = 8
@@ -111,7 +113,7 @@ def timeline(
     """
     scale = _Scale(length)
     longest = sorted(placements, key=lambda one: one.begin - one.end)[:MOST_BARS]
-    rows = _rows(longest)
+    rows = lanes(longest)
     y, bands, content = 4.0, dict[str, tuple[float, float]](), []
     for number, host in enumerate(hosts):
         bars = rows.get(host, [])
@@ -143,18 +145,6 @@ def timeline(
         "timeline",
     )  # fmt: skip
     return Picture(whole, len(placements) - drawn)
-
-
-def _rows(placements: Iterable[Placement]) -> Mapping[str, list[tuple[int, Placement]]]:
-    """Return for each host its placements with their rows, in which they do not overlap."""
-    ends: dict[str, list[float]] = {}
-    rows: dict[str, list[tuple[int, Placement]]] = {}
-    for one in sorted(placements, key=lambda one: one.begin):
-        taken = ends.setdefault(one.host, [])
-        row = next((at for at, end in enumerate(taken) if end <= one.begin), len(taken))
-        taken[row : row + 1] = [one.end]
-        rows.setdefault(one.host, []).append((row, one))
-    return rows
 
 
 def _bar(scale: _Scale, one: Placement, y: float, colour: int) -> str:

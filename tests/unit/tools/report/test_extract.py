@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rosrm_report.extract import report_of, timed_events
-from rosrm_report.model import CloseDecision, HostSpan, Material, Move, Placement, Start, Wait
+from rosrm.timeline.values import HostSpan, Move, Placement, Start, Wait
+from rosrm_report.extract import report_of
+from rosrm_report.model import CloseDecision, Material
 from rosrm_report.page import page_of, summary
 from tests.unit.tools.report.runs import READINGS, decision, events, report
 
@@ -145,19 +146,6 @@ def test_the_time_over_limits_is_counted_for_each_host():
 
     assert [one.over_limit for one in made.hosts] == [5.0, 2.0]
     assert [one.peaks["memory"] for one in made.hosts] == [0.9, 0.3]
-
-
-def test_times_continue_over_a_restart_of_the_master():
-    """The pause of the master is measured by unix time; a clock set back leaves the order."""
-    first, second = events((5, "master_started"), (9, "host_lost", "", "a"))
-    third = replace(second, kind="master_started", elapsed=0.0, wall_time=first.wall_time + 24)
-    fourth = replace(third, kind="host_back", elapsed=3.0)
-
-    assert [time for time, _ in timed_events([first, second, third, fourth])] == [
-        0.0, 4.0, 24.0, 27.0,
-    ]  # fmt: skip
-    back = replace(third, wall_time=0.0)
-    assert [time for time, _ in timed_events([first, second, back])] == [0.0, 4.0, 4.0]
 
 
 def test_what_is_missing_is_said_in_a_sentence():

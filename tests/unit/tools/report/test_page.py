@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from html.parser import HTMLParser
 
+from rosrm.timeline.values import Placement
 from rosrm_report import svg
 from rosrm_report.extract import report_of
-from rosrm_report.model import Material, Placement, Readings, Report
+from rosrm_report.model import Material, Readings, Report
 from rosrm_report.page import MOST_ROWS, page_of
 from tests.unit.tools.report.runs import BEGAN, READINGS, decision, events, report
 

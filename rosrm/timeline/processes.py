@@ -1,14 +1,13 @@
-"""Histories of processes: placements, waits, starts and moves from the events. Pure."""
+"""Histories of processes: placements, waits, starts and moves from the events."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow
-from rosrm_report.model import Move, Outcome, Placement, Start, Wait
+from rosrm.timeline.values import Move, Outcome, Placement, Start, Wait
 
 #: Kinds of events that end the placement of a process.
 _LEAVES: Final = frozenset(
@@ -64,33 +63,22 @@ class _Process:
     destination: int = 0
 
 
-def histories_of(events: Iterable[tuple[float, EventRow]], end: float) -> Histories:
-    """Return the histories of all processes.
-
-    Args:
-        events: with their times, in order.
-        end: of the report.
-    """
-    reader = _Reader()
-    for time, event in events:
-        if event.process:
-            reader.take(time, event)
-    return reader.histories(end)
-
-
 def whole(event: EventRow, fact: str) -> int:
     """Return a fact that is a number of an instance; 0: it is not known."""
     value = event.facts.get(fact)
     return value if isinstance(value, int) else 0
 
 
-class _Reader:
+class ProcessReader:
+    """Reads the events of processes in order."""
+
     def __init__(self) -> None:
         self._found = Histories()
         self._processes: dict[str, _Process] = {}
         self._waiting = 0
 
     def take(self, time: float, event: EventRow) -> None:
+        """Read the next event of a process."""
         kind = event.kind
         one = self._processes.setdefault(event.process, _Process())
         if kind in _LEAVES:
@@ -170,13 +158,18 @@ class _Reader:
             queue.append((time, self._waiting))
 
     def histories(self, end: float) -> Histories:
-        """End all that has not ended, and return the histories."""
+        """Return the histories up to now; what has not ended yet is in them up to `end`."""
         found = self._found
+        placements, waits, outcomes = (
+            list(found.placements),
+            list(found.waits),
+            dict(found.outcomes),
+        )
         for name, one in self._processes.items():
             if one.host:
-                found.placements.append(Placement(name, one.host, one.since, end, one.number))
+                placements.append(Placement(name, one.host, one.since, end, one.number))
             if one.waits_since is not None:
-                found.outcomes[name] = "waiting"
-                found.waits.append(Wait(name, one.waits_since, end, one.reason, over=False))
-        found.placements.sort(key=lambda one: (one.begin, one.process))
-        return found
+                outcomes[name] = "waiting"
+                waits.append(Wait(name, one.waits_since, end, one.reason, over=False))
+        placements.sort(key=lambda one: (one.begin, one.process))
+        return replace(found, placements=placements, waits=waits, outcomes=outcomes)
