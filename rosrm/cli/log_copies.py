@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from heapq import merge
 from operator import itemgetter
 from typing import TYPE_CHECKING
@@ -21,10 +23,23 @@ if TYPE_CHECKING:
     from rosrm.client.client import Client
 
 
-def since_of(text: str) -> float:
-    """Return the option --since as unix time, 0.0 if it is not given; raises `ConfigError`."""
-    hint = ". Give a time span up to now, e.g. 10min"
-    return time.time() - seconds_of("--since", text, hint=hint) if text else 0.0
+def time_of(option: str, text: str) -> float:
+    """Return the time in an option as unix time (s), 0.0 if it is not given.
+
+    Args:
+        option: name of the option, for messages.
+        text: a time span before now, or a date with or without a time, local unless it says so.
+
+    Raises:
+        ConfigError: the text is neither.
+    """
+    if not text:
+        return 0.0
+    try:
+        return datetime.fromisoformat(re.sub(r"[zZ]$", "+00:00", text)).timestamp()
+    except (ValueError, OverflowError):
+        hint = ". Give a time span up to now, e.g. 10min, or a time, e.g. 2026-11-27T09:30"
+        return time.time() - seconds_of(option, text, hint=hint)
 
 
 def copy_logs(client: Client, streams: Sequence[LogStream], selection: LogSelection) -> None:

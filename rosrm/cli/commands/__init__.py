@@ -29,6 +29,7 @@ from rosrm.cli.commands import (
     follow,
     inspect,
     key,
+    logs,
     modes,
     plugin,
     run,
@@ -129,7 +130,7 @@ def common(
     ctx.obj = CommonOptions(domain, cluster)
 
 
-for module in (up, runtimes, applications, modes, change, adopt, inspect, follow):
+for module in (up, runtimes, applications, modes, change, adopt, inspect, follow, logs):
     for function in module.COMMANDS:
         app.command(cls=PlainCommand)(function)
 app.command(cls=PlainCommand, context_settings={"allow_interspersed_args": False})(run.run)

@@ -1,4 +1,4 @@
-"""Commands that can run until Ctrl-C: events, logs, top."""
+"""Commands that can run until Ctrl-C: events, top."""
 
 # Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli import completion, connection
-from rosrm.cli.options import AsJson, Domain, Names, seconds_of
+from rosrm.cli.options import AsJson, Domain, seconds_of
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 from rosrm.wording import counted
@@ -142,67 +142,6 @@ def _say_left_out(shown: int, newest: int) -> None:
         echo(f"rosrm: at most the newest {newest} are shown; -n N shows more", err=True)
 
 
-def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
-    ctx: typer.Context,
-    names: Names,
-    follow: Annotated[
-        bool,
-        typer.Option("--follow", "-f", help="Print new output until the processes have ended."),
-    ] = False,
-    tail: Annotated[
-        int | None,
-        typer.Option(
-            "--tail", metavar="N", min=1, help="Print only the last N lines of each process."
-        ),
-    ] = None,
-    since: Annotated[
-        str,
-        typer.Option(
-            "--since", metavar="TIME", help="Print only output of the last TIME, e.g. 10min."
-        ),
-    ] = "",
-    timestamps: Annotated[
-        bool,
-        typer.Option(
-            "--timestamps", "-t", help="Begin each line with its time, by the clock of its host."
-        ),
-    ] = False,
-    host: Annotated[
-        str,
-        typer.Option(
-            "--host",
-            metavar="HOST",
-            help="Print only output from this host.",
-            autocompletion=completion.hosts,
-        ),
-    ] = "",
-    raw: Annotated[
-        bool,
-        typer.Option("--raw", help="Print colours and other control characters in a terminal too."),
-    ] = False,
-    domain: Domain = None,
-) -> None:
-    """Print the output of processes, from all hosts.
-
-    The output is complete over restarts and moves. Where the size limit of logs dropped output, a
-    line gives the dropped size. In a terminal, control characters are printed as numbers; into a
-    file or pipe the output is copied as it is.
-    """
-    from rosrm.cli.log_copies import copy_logs, since_of
-    from rosrm.cli.output.log_lines import LogStream, is_terminal
-    from rosrm.client.logs import LogSelection
-
-    selection = LogSelection(tail or 0, since_of(since), host, follow)
-    width = max(map(len, names)) if len(names) > 1 else 0
-    as_it_is = raw or not is_terminal()
-    streams = [
-        LogStream(name, f"{name:<{width}} | ".encode() if width else b"", timestamps, as_it_is)
-        for name in dict.fromkeys(names)
-    ]
-    with connection.master(ctx, domain) as client:
-        copy_logs(client, streams, selection)
-
-
 def top(
     ctx: typer.Context,
     period: Annotated[
@@ -240,4 +179,4 @@ def top(
         )  # fmt: skip
 
 
-COMMANDS: Final = (events, logs, top)
+COMMANDS: Final = (events, top)

@@ -11,13 +11,17 @@ import time
 from codecs import IncrementalDecoder, getincrementaldecoder
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
+from rosrm.cli.output.log_search import LineContext, LineSearch, coloured, is_shown, json_line
 from rosrm.client.logs import LogChunk
 from rosrm.wording import printable, size
 
 Marks = Sequence[tuple[float, int, int]]
 #: Unix time by which the output was written, and the output; time 0.0: unknown.
 Piece = tuple[float, bytes]
+#: Bytes after which an endless line is divided.
+_LONGEST_LINE: Final = 1 << 16
 
 
 def show(pieces: Iterable[Piece]) -> None:
@@ -38,10 +42,11 @@ class LogStream:
 
     Attributes:
         name: name of the process.
-        prefix: beginning of each line; b"": no prefix, and bytes are copied unchanged.
+        prefix: beginning of each line; b"": no prefix.
         timestamps: True: each line begins with the time by which it was written, by the clock of
             its host.
         raw: True: control characters, e.g. of colours, stay as the process wrote them.
+        search: lines that are shown; None: all, and without a prefix bytes are copied unchanged.
         wrote: True after the first output.
     """
 
@@ -49,12 +54,15 @@ class LogStream:
     prefix: bytes = b""
     timestamps: bool = False
     raw: bool = True
+    search: LineSearch | None = None
     wrote: bool = False
     _host: str = ""
+    _number: int = 0
     _is_new: bool = False
     _unfinished: bytes = b""
     _when: float = 0.0
     _at_line_start: bool = True
+    _context: LineContext = field(default_factory=LineContext)
     _pieces: list[Piece] = field(default_factory=list)
     _decoder: IncrementalDecoder = field(
         default_factory=lambda: getincrementaldecoder("utf-8")("backslashreplace")
@@ -69,7 +77,8 @@ class LogStream:
         """Add bytes of the process."""
         content, offset, marks = chunk.content, chunk.offset, chunk.marks
         if chunk.is_first:
-            self._host, self._is_new = chunk.host, self.wrote
+            self.close()
+            self._host, self._number, self._is_new = chunk.host, chunk.number, self.wrote
         begun = marks[0][0] if marks else 0.0
         starts = [(at, when) for when, at, pid in marks if pid and 0 <= at - offset < len(content)]
         if chunk.dropped:
@@ -95,6 +104,9 @@ class LogStream:
     def _say(self, text: str, when: float) -> None:
         """Add a line of rosrm; `when` orders it among the lines of other processes."""
         self.close()
+        self._context.begin_program()
+        if self.search is not None and self.search.is_selective:
+            return
         if not self._at_line_start:
             self._add(b"\n")
         self._add(self.prefix + f"--- {text} ---\n".encode(), when)
@@ -103,7 +115,7 @@ class LogStream:
         if not text:
             return
         self.wrote = True
-        if not self.prefix and not self.timestamps:
+        if not self.prefix and not self.timestamps and self.search is None:
             self._add(text)
             return
         at, late = offset, iter(marks)
@@ -113,15 +125,27 @@ class LogStream:
             while mark is not None and mark[1] < at:
                 mark = next(late, None)
             self._when = mark[0] if mark else 0.0
+            self._unfinished += line
             if line.endswith(b"\n"):
-                self._line(self._unfinished + line, self._when)
+                self._line(self._unfinished, self._when)
                 self._unfinished = b""
-            else:
-                self._unfinished += line
+            elif len(self._unfinished) > _LONGEST_LINE:
+                self.close()
 
     def _line(self, line: bytes, when: float) -> None:
-        stamp = f"{_stamp(when)} ".encode() if self.timestamps else b""
-        self._add(self.prefix + stamp + line, when)
+        text, context, search = line.decode(errors="replace"), self._context, self.search
+        context.add(text, when)
+        if search is not None and not is_shown(text, context, search):
+            return
+        if search is not None and search.as_json:
+            form = json_line(text, context, self.name, self._host, self._number)
+            self._pieces.append((context.time, form.encode()))
+            return
+        stamp = f"{_stamp(context.time)} ".encode() if self.timestamps else b""
+        self._add(self.prefix + stamp + line, context.time)
+        if search is not None and search.coloured:
+            time, shown = self._pieces[-1]
+            self._pieces[-1] = time, coloured(shown.decode(), context.level).encode()
 
     def _add(self, text: bytes, when: float = 0.0) -> None:
         if not self.raw:  # a character may be divided between two pieces
