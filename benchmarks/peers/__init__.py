@@ -1,0 +1,1 @@
+"""Comparison with Ray, Dask, Slurm and a bare loop: `python -m benchmarks.peers`."""
