@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
+from rosrm_web.access import Access
 from rosrm_web.app import routes
 from rosrm_web.changes import MOST_READERS
 from rosrm_web.gateway import Gateway
@@ -37,7 +38,7 @@ def web(cluster):
 
 def answers() -> dict[str, Any]:
     """Return the types of the answers of all GET routes, by path."""
-    listed = [one for one in routes(Gateway(None)) if one.method == "GET" and one.answer]
+    listed = [one for one in routes(Gateway(None), Access()) if one.method == "GET" and one.answer]
     return {one.path: one.answer for one in listed}
 
 

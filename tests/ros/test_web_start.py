@@ -9,14 +9,18 @@ import socket
 import ssl
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import ExitStack, suppress
+from http.client import IncompleteRead
 
 import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
 
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.testing.loopback import settings_on_this_machine
+from rosrm_web.connections import MOST_CONNECTIONS
 from tests.ros.web_kit import gateway
-from tests.waiting import PATIENCE
+from tests.waiting import PATIENCE, wait_until
 
 TOKEN = "v" * 32
 
@@ -83,6 +87,71 @@ def test_a_port_in_use_is_one_sentence(ros):
         )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert "is in use" in done.stderr
+
+
+def test_unfinished_requests_keep_no_other_client_out(web):
+    """More of them than the gateway has connections; the heads of some are whole."""
+    head = b"POST /v1/cordon HTTP/1.1\r\nHost: localhost\r\n"
+    with ExitStack() as stack:
+        for number in range(2 * MOST_CONNECTIONS):
+            client = stack.enter_context(socket.create_connection(web.address, timeout=PATIENCE))
+            client.sendall((b"", head, head + b"Content-Length: 9\r\n\r\n")[number % 3])
+        assert web.ask("/v1/status").status == 200
+
+
+def test_pages_are_bounded(web):
+    """The next one is refused with a sentence; a page that no browser opened makes room."""
+    refused = wait_until(
+        lambda: next((one for one in [web.ask("/")] if one.status == 503), None),
+        "a page is refused",
+    )
+    assert "pages are open" in refused.json["detail"]
+    wait_until(lambda: web.ask("/").status == 200, "a place is free again")
+
+
+def test_a_revoked_token_ends_its_streams_and_pages(ros, tmp_path):
+    """Without a restart; users that are still in the file notice nothing."""
+    file = tmp_path / "tokens"
+    file.touch(0o600)
+    ada, eve = {"Authorization": f"Bearer {'a' * 32}"}, {"Authorization": f"Bearer {TOKEN}"}
+    file.write_text(f"viewer ada {'a' * 32}\nviewer eve {TOKEN}\n")
+    with gateway(ros, "--tokens", str(file)) as web, ExitStack() as stack:
+        streams = [stack.enter_context(web.follow(**one)) for one in (ada, eve)]
+        page = f"ws{web.url.removeprefix('http')}/_nicegui_ws/socket.io/?EIO=4&transport=websocket"
+        pages = [stack.enter_context(connect(page, additional_headers=one)) for one in (ada, eve)]
+        assert [one.recv(PATIENCE)[0] for one in pages] == ["0", "0"]  # both are open
+
+        revoked = tmp_path / "new"
+        revoked.touch(0o600)
+        revoked.write_text(f"viewer ada {'a' * 32}\n")
+        revoked.replace(file)
+        with suppress(IncompleteRead):  # the stream has no end of its own
+            assert [one.kind for one in streams[1]] == ["master"]
+        with pytest.raises(ConnectionClosed):
+            pages[1].recv(PATIENCE)
+        assert web.ask("/v1/status", **eve).status == 401
+        assert web.ask("/v1/status", **ada).status == 200
+        pages[0].ping().wait(PATIENCE)
+        assert next(streams[0]).kind == "master"
+
+
+def test_an_invalid_file_of_tokens_keeps_the_former_ones(ros, tmp_path):
+    """The log has the reason, and the metric is 1 until the file is valid again."""
+    file = tmp_path / "tokens"
+    file.touch(0o600)
+    file.write_text(f"viewer eve {TOKEN}\n")
+    eve = {"Authorization": f"Bearer {TOKEN}"}
+    with gateway(ros, "--tokens", str(file)) as web:
+
+        def is_invalid(value: bytes) -> bool:
+            return b"\nrosrm_web_tokens_invalid " + value in web.ask("/metrics", **eve).body
+
+        assert is_invalid(b"0.0")
+        file.chmod(0o644)
+        wait_until(lambda: is_invalid(b"1.0"), "the metric says that the file is invalid")
+        assert any("other users can read or change it" in line for line in web.said)
+        file.chmod(0o600)
+        wait_until(lambda: is_invalid(b"0.0"), "the file is read again")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -20,6 +20,7 @@ from rosrm_web.reading import Host, Log, Reading, Status
 from rosrm_web.tokens import LOGIN
 
 if TYPE_CHECKING:
+    from rosrm_web.access import Access
     from rosrm_web.gateway import Gateway
     from rosrm_web.settings import Settings
 
@@ -42,7 +43,7 @@ class Route(NamedTuple):
     answer: Any
 
 
-def routes(gateway: Gateway) -> list[Route]:
+def routes(gateway: Gateway, access: Access) -> list[Route]:
     """Return all routes."""
     read, act = Reading(gateway), Acting(gateway)
     return [
@@ -54,7 +55,7 @@ def routes(gateway: Gateway) -> list[Route]:
         Route("GET", "/v1/changes", Changes(gateway).follow, None),
         Route("GET", "/v1/explain/{process}", read.explain, dict[str, Any]),
         Route("GET", "/v1/logs/{process}", read.logs, Log),
-        Route("GET", "/metrics", Metrics(gateway).metrics, None),
+        Route("GET", "/metrics", Metrics(gateway, access).metrics, None),
         Route("POST", "/v1/submit", act.submit, Message),
         Route("POST", "/v1/apply", act.apply, ApplyResult),
         Route("POST", "/v1/plan", act.plan, ApplyResult),
@@ -72,21 +73,21 @@ def routes(gateway: Gateway) -> list[Route]:
     ]
 
 
-def create_app(gateway: Gateway, settings: Settings) -> FastAPI:
+def create_app(gateway: Gateway, settings: Settings, access: Access) -> FastAPI:
     """Return the application; `guard.Guard` has to stand before it."""
     app = FastAPI(
         title="rosrm", version=__version__, openapi_url="/v1/openapi.json",
         responses=problems.RESPONSES,
         docs_url=None, redoc_url=None,  # both load scripts from the internet
     )  # fmt: skip
-    for method, path, endpoint, answer in routes(gateway):
+    for method, path, endpoint, answer in routes(gateway, access):
         extra = {"requestBody": _WORK_FILE} if path in _WITH_WORK_FILE else None
         app.add_api_route(
             path, endpoint, methods=[method], response_model=answer, openapi_extra=extra
         )
     for kind, handler in problems.HANDLERS.items():
         app.add_exception_handler(kind, handler)
-    login = Login(settings)
+    login = Login(settings, access)
     app.add_api_route(LOGIN, login.show, methods=["GET"], include_in_schema=False)
     app.add_api_route(LOGIN, login.enter, methods=["POST"], include_in_schema=False)
     app.add_api_route("/v1/{path:path}", _unknown_path, include_in_schema=False)

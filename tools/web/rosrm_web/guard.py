@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm_web import problems
+from rosrm_web.access import Access
 from rosrm_web.settings import Settings
 from rosrm_web.tokens import ANYONE, COOKIE, LOGIN, User, user_of
 
@@ -74,9 +75,9 @@ class Rejected(Exception):
 class Guard:
     """ASGI application that checks requests, and passes valid ones to another application."""
 
-    def __init__(self, app: App, settings: Settings) -> None:
+    def __init__(self, app: App, settings: Settings, access: Access) -> None:
         self._app = app
-        self._settings = settings
+        self._settings, self._access = settings, access
         self._headers = {**_HEADERS, **(_WITH_TLS if settings.certificate else {})}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -99,13 +100,14 @@ class Guard:
         scope["may_act"] = self._settings.is_acting and user.role == "operator"
         acts = scope.get("method", "GET") not in _SAFE
         note = f"{user.name}: {scope['method']} {scope['path']!r:.100}" if acts else ""
-        await self._app(scope, receive, self._hardened(send, note, is_page=is_page))
+        with self._access.open_request(user):
+            await self._app(scope, receive, self._hardened(send, note, is_page=is_page))
 
     def user_of_request(self, scope: Scope, headers: Mapping[str, str]) -> User:
         """Return the user of a request; refuse it if the user may not send it."""
         if scope["path"] == LOGIN:
             return ANYONE
-        users = self._settings.users
+        users = self._access.users
         given = headers.get("authorization") or _of_cookie(headers)
         user = user_of(given, users) if users else ANYONE
         if user is None and scope["path"] == "/":

@@ -8,20 +8,22 @@ import signal
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Final
+from functools import partial
+from typing import TYPE_CHECKING, Final, cast
 
 import uvicorn
 
 from rosrm.errors import ConfigError, NoMaster, Refused
+from rosrm_web.access import Access
 from rosrm_web.app import create_app
+from rosrm_web.connections import MOST_CONNECTIONS, Connection
 from rosrm_web.guard import Guard
 
 if TYPE_CHECKING:
     from rosrm_web.gateway import Gateway
+    from rosrm_web.guard import App
     from rosrm_web.settings import Settings
 
-#: Highest number of connections at the same time; further ones are refused.
-MOST_CONNECTIONS: Final = 128
 #: Bytes of the request line and the headers.
 _LARGEST_HEAD: Final = 16 * 1024
 #: Bytes of a message of the page in the browser.
@@ -74,19 +76,26 @@ def serve(
         listener: listening socket.
         ready: called once when the gateway answers requests.
     """
-    config = uvicorn.Config(
-        Guard(create_app(gateway, settings), settings), loop="asyncio", http="h11", lifespan="on",
+    access = Access(settings.users, settings.tokens)
+    server = http_server(Guard(create_app(gateway, settings, access), settings, access), settings)
+    asyncio.run(_serve(gateway, access, server, listener, ready))
+
+
+def http_server(app: App, settings: Settings) -> uvicorn.Server:
+    """Return a server for an application."""
+    protocol = partial(Connection, tls=settings.tls())
+    return uvicorn.Server(uvicorn.Config(
+        app, loop="asyncio", http=cast("type[asyncio.Protocol]", protocol), lifespan="on",
         log_config=None, access_log=False, server_header=False, proxy_headers=False,
-        limit_concurrency=MOST_CONNECTIONS, h11_max_incomplete_event_size=_LARGEST_HEAD,
-        timeout_graceful_shutdown=1, ws_max_size=_LARGEST_MESSAGE,
-        ssl_certfile=settings.certificate, ssl_keyfile=settings.key,
-    )  # fmt: skip
-    asyncio.run(_serve(gateway, uvicorn.Server(config), listener, ready))
+        h11_max_incomplete_event_size=_LARGEST_HEAD, timeout_graceful_shutdown=1,
+        ws_max_size=_LARGEST_MESSAGE,
+    ))  # fmt: skip
 
 
 async def _serve(
-    gateway: Gateway, server: uvicorn.Server, listener: socket.socket, ready: Callable[[], None]
-) -> None:
+    gateway: Gateway, access: Access, server: uvicorn.Server, listener: socket.socket,
+    ready: Callable[[], None],
+) -> None:  # fmt: skip
     loop = asyncio.get_running_loop()
 
     def stop() -> None:
@@ -96,9 +105,10 @@ async def _serve(
         loop.add_signal_handler(number, stop)
     with suppress(NoMaster, Refused):  # all other errors will not pass
         await gateway.watcher.look()
-    watching = asyncio.create_task(gateway.watcher.run())
+    tasks = [loop.create_task(gateway.watcher.run()), loop.create_task(access.follow_file())]
     ready()
     # uvicorn raises the signal again at its end: `stop` takes it.
     await server.serve(sockets=[listener])
-    watching.cancel()
+    for task in tasks:
+        task.cancel()
     gateway.close()

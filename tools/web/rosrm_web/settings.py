@@ -28,7 +28,8 @@ class Settings:
         certificate: path of the certificate chain; None: plain HTTP.
         key: path of its private key; None: in the file of the certificate.
         names: further names of this machine that a request may address.
-        users: users with tokens; (): everyone may read.
+        tokens: path of the file with the users; None: everyone may read.
+        users: users of that file at the start.
         is_acting: requests of operators act; otherwise the gateway only reads.
     """
 
@@ -37,6 +38,7 @@ class Settings:
     certificate: Path | None = None
     key: Path | None = None
     names: tuple[str, ...] = ()
+    tokens: Path | None = None
     users: tuple[User, ...] = ()
     is_acting: bool = False
 
@@ -49,6 +51,10 @@ class Settings:
     def host_names(self) -> frozenset[str]:
         """Return the names, beside IP addresses, by which a request may address the gateway."""
         return frozenset(name.lower() for name in ("localhost", socket.gethostname(), *self.names))
+
+    def tls(self) -> ssl.SSLContext | None:
+        """Return the context of the server; None: plain HTTP."""
+        return None if self.certificate is None else _tls(self.certificate, self.key)
 
 
 def checked(
@@ -91,7 +97,9 @@ def checked(
             "--allow-actions: only users with a token of an operator may act: give --tokens FILE "
             "with a line `operator NAME TOKEN`"
         )
-    return Settings(address, port, certificate, key, tuple(names), users, allow_actions)
+    return Settings(
+        address, port, certificate, key, tuple(names), tokens, users, is_acting=allow_actions
+    )
 
 
 def _address(listen: str) -> tuple[str, int]:
@@ -115,14 +123,19 @@ def _address(listen: str) -> tuple[str, int]:
 def _check_tls(certificate: Path, key: Path | None) -> None:
     secret = key or certificate
     check_private("--key" if key else "--certificate", secret)
-    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     try:
-        context.load_cert_chain(certificate, key, password=_no_password)
+        _tls(certificate, key)
     except (OSError, ssl.SSLError, ValueError) as error:
         reason = getattr(error, "strerror", None) or getattr(error, "reason", None) or error
         raise ConfigError(
             f"--certificate {certificate}: certificate and key cannot be used: {reason}"
         ) from None
+
+
+def _tls(certificate: Path, key: Path | None) -> ssl.SSLContext:
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key, password=_no_password)
+    return context
 
 
 def _no_password() -> str:

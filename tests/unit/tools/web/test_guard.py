@@ -8,6 +8,7 @@ from hashlib import sha256
 import pytest
 
 from rosrm_web import guard
+from rosrm_web.access import Access
 from rosrm_web.settings import Settings
 from rosrm_web.tokens import User
 
@@ -48,7 +49,7 @@ def request(wanted, *parts, app=None):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guard.Guard(app or Seen(), ACTING)(wanted, receive, send))
+    asyncio.run(guard.Guard(app or Seen(), ACTING, Access(ACTING.users))(wanted, receive, send))
     return sent[0]
 
 
@@ -137,7 +138,11 @@ def test_a_body_that_never_ends_is_refused(monkeypatch):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guard.Guard(Seen(), ACTING)(scope("POST", host="localhost"), never, send))
+    asyncio.run(
+        guard.Guard(Seen(), ACTING, Access(ACTING.users))(
+            scope("POST", host="localhost"), never, send
+        )
+    )
     assert sent[0]["status"] == 408
 
 

@@ -46,6 +46,7 @@ def event(kind, process="talker", wall=0.0, **facts):
 RESOURCES = (resource("memory", 0.4), resource("cpu", 0.9, stale=True))
 HOST = HostRow(HostDescription("alpha", 7), 1, "up", False, True, True, 0.1, RESOURCES, 1)
 LOAD = {"turn_s": 0.02, "write_s": 0.01, "cpu_s": 5, "oldest_reading_s": 0.2, "missed": 3}
+OWN = [(table.TOKENS, (), 0.0)]
 LISTING = Listing(
     "lab", 60.0, 9, hosts=[HOST],
     processes=[
@@ -92,7 +93,7 @@ def test_the_text_has_every_metric_with_the_labels_of_the_table():
     families = {
         family.name: family
         for family in text_string_to_metric_families(
-            exposition(LISTING, 0.1, counted, LOAD).decode()
+            exposition(LISTING, 0.1, counted, LOAD, OWN).decode()
         )
     }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from rosrm.errors import ConfigError
+from rosrm_web.access import Access
 from rosrm_web.guard import Guard, Rejected
 from rosrm_web.settings import Settings, checked
 from rosrm_web.tokens import read_tokens, user_of
@@ -100,7 +101,7 @@ def test_the_user_of_a_header(write, header, name):
 
 def ask(write, method, token, *, acting=True):
     """Return the user of a request, as far as tokens and rights are concerned."""
-    guard = Guard(None, Settings(users=read_tokens(write()), is_acting=acting))
+    guard = Guard(None, Settings(is_acting=acting), Access(read_tokens(write())))
     headers = {"authorization": f"Bearer {token}"} if token else {}
     return guard.user_of_request({"type": "http", "method": method, "path": "/v1/hosts"}, headers)
 
@@ -135,7 +136,7 @@ def test_a_request_without_the_right_is_refused(write, method, token, acting, st
 
 def test_without_tokens_everyone_reads_and_nobody_acts():
     """The default on this machine."""
-    guard = Guard(None, Settings())
+    guard = Guard(None, Settings(), Access())
 
     assert (
         guard.user_of_request({"type": "http", "method": "GET", "path": "/v1/hosts"}, {}).role

@@ -28,7 +28,7 @@ disable_created_metrics()  # a series with a time of creation beside each counte
 
 def exposition(
     listing: Listing | None, seconds: float = 0.0, counted: EventMetrics | None = None,
-    load: Mapping[str, float] = MappingProxyType({}),
+    load: Mapping[str, float] = MappingProxyType({}), more: Iterable[Sample] = (),
 ) -> bytes:  # fmt: skip
     """Return all metrics as text.
 
@@ -37,8 +37,9 @@ def exposition(
         seconds: in which the master answered.
         counted: metrics of events; None: none were counted.
         load: of the master, as `Client.master_load` returns it.
+        more: values of the process that writes the text.
     """
-    values: list[Sample] = [(table.UP, (), float(listing is not None))]
+    values: list[Sample] = [(table.UP, (), float(listing is not None)), *more]
     if listing is not None:
         values += [*samples(listing, seconds), *of_load(load)]
     after = b"" if counted is None else bytes(generate_latest(counted.registry))

@@ -118,11 +118,15 @@ WAIT: Final = Metric(
 START: Final = Metric(
     "rosrm_start_seconds", "histogram", (), "time from the choice of a host until a process runs"
 )
+TOKENS: Final = Metric(
+    "rosrm_web_tokens_invalid", "gauge", (),
+    "1: the changed file of tokens is invalid, and the former tokens stay valid; `rosrm web` only",
+)  # fmt: skip
 
 #: Metrics of the present, and metrics that events count.
 PRESENT: Final = (
     UP, UPTIME, ANSWER, TURN, WRITE, MASTER_CPU, OLDEST, MISSED, TROUBLE, SEQUENCE,
     HOSTS, HOST_UP, HOST_CORDONED, HOST_AGE, HOST_PROCESSES, USAGE, IN_FLIGHT, LIMIT, CAPACITY,
-    PROCESSES, QUEUE, QUEUE_AGE, CPU, MEMORY, RESTARTS, LEFT_OUT, APPLICATIONS, PLUGINS,
+    PROCESSES, QUEUE, QUEUE_AGE, CPU, MEMORY, RESTARTS, LEFT_OUT, APPLICATIONS, PLUGINS, TOKENS,
 )  # fmt: skip
 COUNTED: Final = (EVENTS, MIGRATIONS, MIGRATION_TIME, WAIT, START)

@@ -12,6 +12,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from rosrm_web.tokens import COOKIE, user_of
 
 if TYPE_CHECKING:
+    from rosrm_web.access import Access
     from rosrm_web.settings import Settings
 
 _FORM: Final = """<!doctype html>
@@ -27,8 +28,8 @@ autocomplete="current-password"></label> <button>Log in</button></form></main></
 class Login:
     """Endpoints of the form."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    def __init__(self, settings: Settings, access: Access) -> None:
+        self._settings, self._access = settings, access
 
     async def show(self) -> Response:
         """Show the form."""
@@ -38,7 +39,7 @@ class Login:
         """Check the token of the form, and set the cookie."""
         body = (await request.body()).decode("latin-1")
         token = parse_qs(body).get("token", [""])[0].strip()
-        if user_of(f"Bearer {token}", self._settings.users) is None:
+        if user_of(f"Bearer {token}", self._access.users) is None:
             return _page("The token is wrong.", 401)
         answer = RedirectResponse("/", 303)
         answer.set_cookie(

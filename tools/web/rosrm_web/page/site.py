@@ -5,9 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
+from fastapi import Depends
+from nicegui import Client, ui
 from nicegui import app as nicegui_app
-from nicegui import ui
 
+from rosrm_web.master_link import Busy
 from rosrm_web.page import dialogs, rows, views
 from rosrm_web.page.live import Live
 
@@ -16,6 +18,10 @@ if TYPE_CHECKING:
 
     from rosrm_web.gateway import Gateway
 
+#: Highest number of pages at the same time.
+MOST_PAGES: Final = 32
+#: Seconds after which a page to which no browser has connected makes room for another one.
+_UNUSED: Final = 5.0
 #: Events in the table.
 _SHOWN_EVENTS: Final = 200
 _STYLE: Final = """
@@ -33,8 +39,17 @@ def mount(app: FastAPI, gateway: Gateway) -> None:
     """Add the page to the application of the gateway, at `/`."""
     live = Live(gateway)
     nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
-    ui.page("/", title="rosrm", dark=None)(partial(_page, gateway, live))
+    room = [Depends(partial(_check_room, live))]
+    ui.page("/", title="rosrm", dark=None, dependencies=room)(partial(_page, gateway, live))
     ui.run_with(app, show_welcome_message=False, language="en-US")
+
+
+async def _check_room(live: Live) -> None:
+    """Refuse one more page; raises `Busy`."""
+    if len(live.on_change) >= MOST_PAGES:
+        Client.prune_instances(client_age_threshold=_UNUSED)
+    if len(live.on_change) >= MOST_PAGES:
+        raise Busy(f"{MOST_PAGES} pages are open already; close one, or try again later")
 
 
 async def _page(gateway: Gateway, live: Live) -> None:

@@ -1,0 +1,85 @@
+"""Users of a running gateway: their file is read again when it changes."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, Final
+
+from rosrm.errors import ConfigError
+from rosrm_web.tokens import User, read_tokens
+
+#: Seconds between two looks at the file.
+PERIOD: Final = 1.0
+
+_log = logging.getLogger("rosrm.web")
+
+
+class Access:
+    """The users, and the requests that each of them has open.
+
+    Args:
+        users: users at the start.
+        path: of the file with their tokens; None: there is no file.
+
+    Attributes:
+        users: users whose tokens are valid; (): everyone may read.
+        trouble: why the changed file is not used; "": `users` are those of the file.
+    """
+
+    def __init__(self, users: tuple[User, ...] = (), path: Path | None = None) -> None:
+        self.users = users
+        self.trouble = ""
+        self._path = path
+        self._seen = _state(path)
+        self._open: set[tuple[User, asyncio.Task[Any]]] = set()
+
+    async def follow_file(self) -> None:
+        """Look at the file regularly, until the task is cancelled."""
+        while self._path is not None:
+            await asyncio.sleep(PERIOD)
+            self.look(self._path)
+
+    def look(self, path: Path) -> None:
+        """Read the file again if it has changed, and end the requests of users that left it.
+
+        An invalid file changes nothing.
+        """
+        state = _state(path)
+        if state == self._seen:
+            return
+        self._seen = state
+        try:
+            self.users = read_tokens(path)
+        except ConfigError as error:
+            self.trouble = str(error)
+            _log.error("tokens: the former ones stay valid: %s", error)
+            return
+        self.trouble = ""
+        _log.info("tokens: read again: %d users", len(self.users))
+        for user, request in self._open:
+            if user not in self.users:
+                request.cancel()
+
+    @contextmanager
+    def open_request(self, user: User) -> Iterator[None]:
+        """Let `look` cancel the present task when the user's token is revoked."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._open.add((user, task))
+        try:
+            yield
+        finally:
+            self._open.discard((user, task))
+
+
+def _state(path: Path | None) -> tuple[int, ...]:
+    """Return values that change with the file or its mode; (): it is not there."""
+    with suppress(OSError):
+        if path is not None:
+            state = path.stat()
+            return state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns
+    return ()
