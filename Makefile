@@ -14,6 +14,10 @@ BENCHMARKS := decide latency throughput command apply slave_cost keep_cost balan
 unexport _ROS_WHEELS_BOOTSTRAP_COMPLETE LD_LIBRARY_PATH PYTHONPATH PYTHONHOME VIRTUAL_ENV
 unexport AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH ROS_DISTRO RMW_IMPLEMENTATION
 
+# Many container images set this. Every process of a cluster would then compile rosrm from its
+# source, which doubles the CPU time of its start.
+unexport PYTHONDONTWRITEBYTECODE
+
 # By default DDS multicasts on every interface: what runs from here stays on this machine.
 export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 
