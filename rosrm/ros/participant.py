@@ -8,6 +8,7 @@ service callback. So `serve` defers every response, and a request may stay open 
 from __future__ import annotations
 
 import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -30,6 +31,9 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+#: Held while a participant is created, because Fast DDS reads the environment, which all threads
+#: share; otherwise one of two participants has no profile.
+_CREATION: Final = threading.Lock()
 #: Seconds after which `spin` returns although messages still arrive.
 _FLOOD: Final = 0.05
 
@@ -71,7 +75,7 @@ class Participant:
             profile = bound(os.environ, pace, interface)
         else:
             profile = announcing_part(os.environ, pace)
-        with profile:
+        with _CREATION, profile:
             # Without the logging of ROS, which would leave an empty file for each command. Unlike
             # `rclpy.init`, this installs no signal handlers.
             self.context.init(domain_id=settings.domain, initialize_logging=False)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import pytest
 
 from rosrm import Client, NoMaster
+from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.testing.loopback import settings_on_this_machine
 from tests.pages import PYTHON, blocks, run_examples
 from tests.ros.clusters import host
-from tests.waiting import quickest
+from tests.waiting import PATIENCE, quickest
 
 
 @pytest.mark.timeout(240)
@@ -36,3 +41,18 @@ def test_a_client_without_a_master_says_so_within_its_time_out():
 
     with claim:
         quickest(connect, 2.5)
+
+
+def test_several_threads_join_ros_at_the_same_time():
+    """Fast DDS reads the environment, which the participants of all threads change and restore."""
+    domain, claim = claim_domain()
+    together = threading.Barrier(4)
+
+    def join(number: int) -> None:
+        together.wait(PATIENCE)
+        Participant(settings_on_this_machine(domain), f"client_{number}").close()
+
+    with claim, ThreadPoolExecutor(4) as threads:
+        for _ in range(20):
+            list(threads.map(join, range(4)))
+    assert "FASTRTPS_DEFAULT_PROFILES_FILE" not in os.environ
