@@ -56,3 +56,13 @@ def tab(browser: Any, url: str, **options: Any) -> Iterator[Any]:
 
 def _is_outside(url: str) -> bool:
     return not url.startswith(("http://127.0.0.1:", "ws://127.0.0.1:", "data:", "blob:"))
+
+
+def row(page: Any, name: str) -> Any:
+    """Return the row of a host or process in the visible table."""
+    return page.locator(".ag-row:visible", has_text=name).first
+
+
+def open_tab(page: Any, name: str) -> None:
+    """Show the tab of this name."""
+    page.get_by_role("tab", name=name).click()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from tests.ros.browser_kit import browser, tab
+from tests.ros.browser_kit import browser, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
@@ -54,15 +54,6 @@ def page(chromium, web: Gateway):
     with tab(chromium, web.url) as one:
         row(one, "robot-1").wait_for()
         yield one
-
-
-def row(page: Any, name: str) -> Any:
-    """Return the row of a host or process in the visible table."""
-    return page.locator(".ag-row:visible", has_text=name).first
-
-
-def open_tab(page: Any, name: str) -> None:
-    page.get_by_role("tab", name=name).click()
 
 
 def test_hosts_and_processes_are_in_tables(page, cluster):

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
-from rosrm_web.page.rows import changed, host_rows, problems, process_rows
+from rosrm_web.page.rows import changed, host_rows, problems, process_row
 
 TABLES = st.dictionaries(st.sampled_from("abcdef"), st.integers(0, 3))
 
@@ -52,7 +52,7 @@ def test_a_host_shows_usage_limit_and_marks():
 
 def test_a_process_shows_why_it_is_not_well_in_one_line():
     """Further lines of a reason are in its dialog."""
-    row = process_rows([process("p", "failed", reason="exit code 4\ndetails")])["p"]
+    row = process_row(process("p", "failed", reason="exit code 4\ndetails"))
 
     assert (row["state"], row["why"], row["memory"]) == ("failed", "exit code 4", "2.0 MB")
 

@@ -1,8 +1,10 @@
 """The page in the browser, drawn by NiceGUI in the gateway's process.
 
-rows    PURE: rows of the tables, and what is wrong, from a listing
-live    reads the cluster while a browser shows the page
-site    the page and its tabs
-views   hosts, processes and events as tables
-dialogs explanation, logs, and confirmation of an action
+rows       PURE: rows of the tables, and what is wrong, from a listing
+tree       PURE: rows of processes and their groups
+live       reads the cluster while a browser shows the page
+site       the page and its tabs
+views      the grid of all tables, and the columns of hosts and events
+processes  the tree of processes, with its search
+dialogs    explanation, logs, and confirmation of an action
 """

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from rosrm.model.rows import EventRow, HostRow, Listing, ProcessRow, ResourceRow
-from rosrm.wording import counted, first_line, percent, size
+from rosrm.wording import counted, first_line, percent, size, words
 
 Row = Mapping[str, Any]
 
 #: States of hosts and of processes that are not well, the gravest first, with their styles.
 _HOST_TROUBLE: Final = {"lost": "bad", "suspect": "poor"}
-_PROCESS_TROUBLE: Final = {
+PROCESS_TROUBLE: Final = {
     "failed": "bad", "unreachable": "bad", "stuck": "bad", "set_aside": "poor", "backoff": "poor",
 }  # fmt: skip
 #: Resources of a host in the table of hosts, each with a column of its own.
@@ -82,7 +82,7 @@ def _host(row: HostRow) -> Row:
         "state": ", ".join([row.state, *marks]),
         "style": _HOST_TROUBLE.get(row.state, ""),
         "processes": row.processes,
-        **{name: _usage(one) for name, one in usages.items()},
+        **{name: _share(one) for name, one in usages.items()},
         **{f"{name}_share": round(one.usage, 2) for name, one in usages.items()},
         **{f"{name}_limit": round(one.limit, 2) for name, one in usages.items()},
         "labels": ", ".join(f"{key}={value}" for key, value in row.description.labels.items()),
@@ -90,28 +90,31 @@ def _host(row: HostRow) -> Row:
     }
 
 
-def _usage(resource: ResourceRow) -> str:
+def _share(resource: ResourceRow) -> str:
     text = f"{percent(resource.usage)} % of {percent(resource.limit)} %"
     return f"{text} (old)" if resource.stale else text
 
 
-def process_rows(processes: Iterable[ProcessRow]) -> dict[str, Row]:
-    """Return the rows of the table of processes by their ids."""
-    return {row.name: _process(row) for row in processes}
-
-
-def _process(row: ProcessRow) -> Row:
+def process_row(row: ProcessRow) -> Row:
+    """Return the row of a process."""
     return {
         "id": row.name,
-        "application": row.application,
         "process": row.name,
-        "state": row.state,
-        "style": _PROCESS_TROUBLE.get(row.state, ""),
+        "state": words(row.state),
+        "style": PROCESS_TROUBLE.get(row.state, ""),
         "host": row.host,
-        "cpu": f"{row.cpu:.2f}" if row.cpu else "",
-        "memory": size(row.memory) if row.memory else "",
+        **usage_cells(row.cpu, row.memory),
         "restarts": row.restarts or "",
         "why": first_line(row.reason),
+    }
+
+
+def usage_cells(cpu: float, memory: int) -> Row:
+    """Return the cells of CPU and memory; `bytes` is for sorting."""
+    return {
+        "cpu": f"{cpu:.2f}" if cpu else "",
+        "memory": size(memory) if memory else "",
+        "bytes": float(f"{memory:.3g}"),
     }
 
 
@@ -136,11 +139,11 @@ def problems(listing: Listing) -> list[Problem]:
     """Return what is wrong, hosts first."""
     tables = (
         ("hosts", _HOST_TROUBLE, [row.state for row in listing.hosts], "host", "hosts"),
-        ("processes", _PROCESS_TROUBLE, [row.state for row in listing.processes],
+        ("processes", PROCESS_TROUBLE, [row.state for row in listing.processes],
          "process", "processes"),
     )  # fmt: skip
     return [
-        Problem(table, state, f"{counted(number, one, many)} {state.replace('_', ' ')}")
+        Problem(table, state, f"{counted(number, one, many)} {words(state)}")
         for table, bad, states, one, many in tables
         for state in bad
         if (number := states.count(state))

@@ -12,6 +12,8 @@ from nicegui import app as nicegui_app
 from rosrm_web.master_link import Busy
 from rosrm_web.page import dialogs, rows, views
 from rosrm_web.page.live import Live
+from rosrm_web.page.processes import Processes
+from rosrm_web.page.tree import Choice
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -28,6 +30,8 @@ _STYLE: Final = """
 :root { --rosrm-bar: #9fc5e8; --rosrm-over: #f4a6a6; }
 .body--dark { --rosrm-bar: #1f4e79; --rosrm-over: #7f1d1d; }
 .rosrm-grid { height: calc(100vh - 13rem); min-height: 16rem; }
+.rosrm-tools ~ .rosrm-grid { height: calc(100vh - 17rem); }
+.rosrm-mark { display: inline-block; width: 1.2em; cursor: pointer; }
 .rosrm-bad { color: #b00020; font-weight: 700; }
 .rosrm-poor { color: #8a5a00; font-weight: 700; }
 .body--dark .rosrm-bad { color: #ff8a80; }
@@ -87,7 +91,7 @@ class Page:
                 on_host = self._host.open if may_act else None
                 self._hosts = views.Table(views.HOSTS, "Hosts", on_host)
             with ui.tab_panel("processes").classes("p-0"):
-                self._processes = views.Table(views.PROCESSES, "Processes", self._process.open)
+                self._processes = Processes(self._process.open)
             with ui.tab_panel("events").classes("p-0"):
                 self._events = views.Table(views.EVENTS, "Events")
         self._problems: list[rows.Problem] = []
@@ -108,7 +112,7 @@ class Page:
         if listing is None:
             return
         self._hosts.show(rows.host_rows(listing.hosts))
-        self._processes.show(rows.process_rows(listing.processes))
+        self._processes.show(listing.processes)
         self._events.show(rows.event_rows(self._live.events, _SHOWN_EVENTS))
         found = rows.problems(listing)
         if found != self._problems:
@@ -126,12 +130,14 @@ class Page:
 
     def _filter(self, problem: rows.Problem) -> None:
         self._tabs.value = problem.table
-        table = self._hosts if problem.table == "hosts" else self._processes
-        table.narrow(state=problem.state)
+        if problem.table == "hosts":
+            self._hosts.narrow(state=problem.state)
+        else:
+            self._processes.choose(Choice(problem.state))
 
     def _show_all(self) -> None:
         self._hosts.narrow()
-        self._processes.narrow()
+        self._processes.choose(Choice())
 
     def leave(self) -> None:
         """End the updates of this browser."""

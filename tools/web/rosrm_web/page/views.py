@@ -1,4 +1,4 @@
-"""Tables of the page: hosts, processes and events."""
+"""Tables of the page: what all have in common, and the columns of hosts and events."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from nicegui import ui
 
+from rosrm.model.values import EMPTY
 from rosrm_web.page.rows import Row, changed
 
 #: Cells have text, never HTML: names and messages come from other machines.
@@ -19,7 +20,7 @@ _OPTIONS: Final = {
     "ensureDomOrder": True,
 }
 #: A colour and a weight, because some users cannot tell these colours apart.
-_STATE: Final = {
+STATE: Final = {
     "field": "state",
     "headerName": "State",
     "cellClassRules": {f"rosrm-{style}": f"data.style === '{style}'" for style in ("bad", "poor")},
@@ -47,23 +48,13 @@ def usage(name: str, title: str = "") -> dict[str, Any]:
 
 HOSTS: Final = (
     column("host", width=150),
-    _STATE,
+    STATE,
     column("processes", width=110),
     usage("cpu", "CPU"),
     usage("memory"),
     usage("disk"),
     column("more", "Other resources", width=180),
     column("labels", flex=1, minWidth=160),
-)
-PROCESSES: Final = (
-    column("application", width=140, sort="asc", sortIndex=0),
-    column("process", width=190, sort="asc", sortIndex=1),
-    _STATE,
-    column("host", width=130),
-    column("cpu", "CPU", width=80),
-    column("memory", width=100),
-    column("restarts", width=100),
-    column("why", flex=1, minWidth=200),
 )
 EVENTS: Final = (
     column("sequence", "Number", width=100, sort="desc"),
@@ -78,33 +69,52 @@ EVENTS: Final = (
 )
 
 
+#: Sends the keys that act on a row; the grid itself moves between cells.
+_KEYS: Final = """(event) => {
+  const cell = event.target.closest(".ag-cell"), row = event.target.closest(".ag-row");
+  if (cell && row && ["Enter", "ArrowLeft", "ArrowRight"].includes(event.key))
+    emit({key: event.key, id: row.getAttribute("row-id"), column: cell.getAttribute("col-id")});
+}"""
+
+
 class Table:
     """A grid that gets only the rows that changed.
 
     Args:
         columns: of AG Grid.
         label: for screen readers.
-        on_select: called with the id of a row that the user chooses; None: rows are not chosen.
+        on_open: called with the id of a row after a double click, or Enter; None: rows do not open.
+        options: further ones of AG Grid.
     """
 
     def __init__(
         self, columns: Sequence[Mapping[str, Any]], label: str,
-        on_select: Callable[[str], None] | None = None,
+        on_open: Callable[[str], None] | None = None, options: Mapping[str, Any] = EMPTY,
     ) -> None:  # fmt: skip
-        self._shown: dict[str, Row] | None = None
-        options = {**_OPTIONS, "columnDefs": list(columns), "rowData": []}
-        self._grid = ui.aggrid(options, theme="quartz", auto_size_columns=False)
-        self._grid.classes("w-full rosrm-grid").props(f'aria-label="{label}"')
-        if on_select is not None:
-            self._grid.on("cellDoubleClicked", lambda event: on_select(event.args["data"]["id"]))
+        self.shown: dict[str, Row] | None = None
+        merged = {**_OPTIONS, **options, "columnDefs": list(columns), "rowData": []}
+        self.grid = ui.aggrid(merged, theme="quartz", auto_size_columns=False)
+        self.grid.classes("w-full rosrm-grid").props(f'aria-label="{label}"')
+        self._on_open = on_open
+        self.grid.on("cellDoubleClicked", lambda event: self._open(event.args["data"]["id"]))
+        self.grid.on("keydown", lambda event: self.take_key(**event.args), js_handler=_KEYS)
+
+    def _open(self, row_id: str) -> None:
+        if self._on_open is not None:
+            self._on_open(row_id)
+
+    def take_key(self, key: str, id: str, column: str) -> None:  # noqa: A002, ARG002 - as sent
+        """React to a key in a cell of a row."""
+        if key == "Enter":
+            self._open(id)
 
     def show(self, rows: Mapping[str, Row]) -> None:
         """Show rows by their ids."""
-        if self._shown is None:
-            self._grid.options["rowData"] = list(rows.values())
-        elif change := changed(self._shown, rows):
-            self._grid.run_grid_method("applyTransaction", change.transaction())
-        self._shown = dict(rows)
+        if self.shown is None:
+            self.grid.options["rowData"] = list(rows.values())
+        elif change := changed(self.shown, rows):
+            self.grid.run_grid_method("applyTransaction", change.transaction())
+        self.shown = dict(rows)
 
     def narrow(self, **values: str) -> None:
         """Show only rows with these values of columns; without values, all rows."""
@@ -112,4 +122,4 @@ class Table:
             name: {"filterType": "text", "type": "startsWith", "filter": value}
             for name, value in values.items()
         }
-        self._grid.run_grid_method("setFilterModel", model or None)
+        self.grid.run_grid_method("setFilterModel", model or None)
