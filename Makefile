@@ -25,7 +25,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
-.PHONY: help setup environment check test lint format demo demo-migration demo-rollout bench evaluation fuzz clean
+.PHONY: help setup environment check test lint format docs docs-links demo demo-migration demo-rollout bench evaluation fuzz clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
@@ -58,6 +58,16 @@ lint: setup ## ruff, the architecture's contracts, mypy
 format: setup ## correct what ruff can correct
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+# Without -W on the links: an answer that is slow or moved is reported, and does not end the check.
+SPHINX := $(BIN)/python -m sphinx -c docs/site -d build/doctrees -j auto
+
+docs: setup ## the documentation as a site: out/docs/index.html
+	@$(SPHINX) -W --keep-going -q -b html . out/docs
+	@echo "The site: out/docs/index.html"
+
+docs-links: setup ## follow the links of the documentation to other sites (network)
+	@$(SPHINX) -q -b linkcheck . out/docs-links
 
 demo: environment ## three hosts on this machine map a LiDAR drive: out/demo/
 	@$(BIN)/python -m rosrm_examples.demo --out out/demo

@@ -94,6 +94,7 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/how-to/ubuntu-24.04-with-apt-ros.md": "apt",
     "docs/how-to/launch-files.md": "`launch` of a ROS installation, which no package index has",
     "docs/reference/metrics.md": "it ends with Ctrl-C; tests/ros/test_web_metrics.py runs it",
+    "docs/how-to/documentation.md": "tests/integration/test_docs_site.py builds the site",
     "docs/how-to/web.md": "it ends with Ctrl-C; tests/ros/test_web.py sends the requests",
     "docs/evaluation.md": "40 minutes; tests/integration/test_paper.py runs its parts",
 }

@@ -29,7 +29,9 @@ from rosrm.model.values import (
     ResourceDescription,
 )
 
+#: Numpy array of 64-bit floats.
 FloatArray = npt.NDArray[np.float64]
+#: Numpy array of booleans.
 BoolArray = npt.NDArray[np.bool_]
 
 

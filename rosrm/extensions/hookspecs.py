@@ -30,6 +30,7 @@ from rosrm.extensions.sinks import SinkOffer
 
 # The group of the entry points is also the name of the pluggy project.
 hookspec = pluggy.HookspecMarker(GROUP)
+#: Decorator that marks the hooks of a plugin.
 hookimpl = pluggy.HookimplMarker(GROUP)
 
 

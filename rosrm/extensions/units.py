@@ -162,13 +162,19 @@ class Quantity:
             raise
 
 
+#: Duration of at least 0: `10`, `"500ms"`, `"2min"`.
 Seconds = Annotated[float, Quantity("duration")]
+#: Duration greater than 0.
 PositiveSeconds = Annotated[float, Quantity("duration", above=True)]
 ByteRate = Annotated[float, Quantity("rate", high=LARGEST_RATE)]
 PositiveByteRate = Annotated[float, Quantity("rate", high=LARGEST_RATE, above=True)]
+#: Size: `1048576`, `"1MiB"`, `"500 MB"`.
 Bytes = Annotated[int, Quantity("size", whole=True)]
+#: Number from 0 to 1: `0.8` means 80 %.
 Fraction = Annotated[float, Quantity(high=1.0, hint="a fraction: 0.8 means 80 %")]
+#: Whole number of at least 0.
 Count = Annotated[int, Quantity(high=2**31 - 1, whole=True)]
+#: Whole number of at least 1.
 PositiveCount = Annotated[int, Quantity(low=1, high=2**31 - 1, whole=True)]
 ANY_AMOUNT: Final = Quantity("amount")
 #: Amount of any resource; `amount_of` is stricter where the resource is known.
@@ -179,6 +185,7 @@ class IsResource:
     """Annotation of text that names a resource; a name that no probe reads is refused in a file."""
 
 
+#: Name of a resource that an installed probe reads.
 ResourceName = Annotated[str, IsResource()]
 
 _MEASURES: Final = {"memory": "size", "disk": "size", "cpu": "cores"}

@@ -235,6 +235,7 @@ class Execute:
     undo: Step | None = None
 
 
+#: Any step of a plan.
 Step = (
     Start | AwaitReady | AwaitReleased | Stop | Configure | SetRestart | SetLifecycle | Commit
     | Execute

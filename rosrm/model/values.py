@@ -42,6 +42,7 @@ RestartCondition = Literal["never", "on-failure", "always"]
 ReadinessKind = Literal["auto", "graph", "running"]
 HostLossAction = Literal["wait", "elsewhere", "stop"]
 IsolationAction = Literal["keep", "stop"]
+#: How the reservation of a need for a resource ends; see the reference of plugins.
 Accounting = Literal["attributed", "shared", "countable"]
 Relation = Literal["near", "apart"]
 Enforcement = Literal["preferred", "required"]
