@@ -79,7 +79,7 @@ def mark_rejoined(state: MasterState, host: Host, now: float) -> None:
 
 def review_lost_hosts(state: MasterState, now: float) -> None:
     """Give up every due instance on lost or detached hosts."""
-    for column in np.flatnonzero(np.isin(state.hosts.condition, _OUT_OF_REACH)):
+    for column in np.flatnonzero(state.hosts.having(_OUT_OF_REACH)):
         _review(state, state.hosts.hosts[column], now)
 
 

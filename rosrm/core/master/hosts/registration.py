@@ -238,7 +238,7 @@ def review_departures(state: MasterState, now: float) -> None:
     A slave that stops accepts no work from before its own `leave` on.
     """
     table = state.hosts
-    departed = np.isin(table.condition, (HostCondition.LEFT, HostCondition.DETACHED))
+    departed = table.having((HostCondition.LEFT, HostCondition.DETACHED))
     for column in np.flatnonzero(departed & table.accepting):
         host = table.hosts[column]
         reports = not host.pruned and table.last_contact[column] - host.left_since >= _STILL_THERE

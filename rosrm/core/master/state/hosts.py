@@ -424,10 +424,15 @@ class HostTable(HostColumns):
         silent = self.without_reading() | (self.accepting & ~self.asking)
         return np.flatnonzero(young & silent)
 
+    def having(self, conditions: Sequence[HostCondition]) -> BoolArray:
+        """Return the mask, (H,), of hosts with one of some conditions."""
+        wanted = np.zeros(len(HostCondition), np.bool_)
+        wanted[list(conditions)] = True
+        return wanted[self.condition]  # much faster than np.isin
+
     def silent_hosts(self) -> list[int]:
         """Return the ids of hosts that have reported and are silent now."""
-        silent = np.isin(self.condition, _SILENT)
-        return [int(column) + 1 for column in np.flatnonzero(silent)]
+        return [int(column) + 1 for column in np.flatnonzero(self.having(_SILENT))]
 
     def why_unreachable(self, host: Host) -> str:
         """Return why a host cannot be reached, without its name; "" if it can."""
