@@ -313,7 +313,7 @@ class MasterRuntime:
                 self._take_in(now)
                 if self._diagnostics is not None:
                     self._diagnostics.advance(now, self._core_now(now), self._trouble())
-                self._endpoint.note_turn(self._now() - now)
+                self._endpoint.load.note_turn(self._now() - now)
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
 
@@ -371,7 +371,10 @@ class MasterRuntime:
         while self._held is None and (events := self._endpoint.take_events()):
             commands: list[Command] = []
             for event in events:
+                begun = self._now()
                 decided = step(self._state, event, core_now)
+                if decided:
+                    self._endpoint.load.note_decision(self._now() - begun)
                 if self._recorder is not None:
                     self._recorder.note(event, core_now, self._state.wall, decided)
                 commands += decided
@@ -470,7 +473,7 @@ class MasterRuntime:
         try:
             return self._journal.write(records, intents, begun - self._started)
         finally:
-            self._endpoint.note_write(self._now() - begun)
+            self._endpoint.load.note_write(self._now() - begun)
 
 
 def what_runs(state: MasterState) -> str:

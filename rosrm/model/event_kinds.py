@@ -133,7 +133,7 @@ class EventKind(str, Enum):
     MIGRATION_TAKEN_UP = "migration_taken_up", "a restarted master continues the migration"
     MIGRATION_FORGOTTEN = "migration_forgotten", "a restarted master cannot continue the migration"
     MIGRATION_REFUSED = "migration_refused", "a process is not moved as requested, with the reason"
-    MIGRATED = "migrated", "the process moved; facts: hosts, seconds, cause, strategy"
+    MIGRATED = "migrated", "the process moved; facts: hosts, seconds, blackout, cause, strategy"
     STAYED = "stayed", "the migration failed, and the process runs where it was"
     HANDOFF_REPORTED = "handoff_reported", "source or destination reports its phase of the handoff"
     TAKE_OVER = "take_over", "the source ended during the handoff: the destination takes over"

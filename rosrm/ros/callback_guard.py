@@ -25,10 +25,12 @@ class CallbackGuard:
     Attributes:
         interrupted: a Ctrl-C, or an exception of a signal handler, that arrived in a callback; the
             loop has to raise it.
+        dropped: number of callbacks that failed, each with its message.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self.interrupted: BaseException | None = None
+        self.dropped = 0
         self._clock = clock
         self._places: dict[str, tuple[float, int]] = {}
 
@@ -55,6 +57,7 @@ class CallbackGuard:
 
     def _note(self, place: str, callback: str, reason: str) -> None:
         """Log a failure, at most once a second for each place."""
+        self.dropped += 1
         now = self._clock()
         logged, unlogged = self._places.get(place, (float("-inf"), 0))
         if now - logged < _LOGGED_EVERY:

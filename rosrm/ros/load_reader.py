@@ -13,7 +13,10 @@ from rosrm.ros.sealed import SealedEndpoints
 from rosrm_msgs import msg
 
 #: Figures that are numbers; docs/reference/protocol.md has their meanings.
-_NUMBERS: Final = ("hosts", "cycles", "missed", "cpu_s", "turn_s", "write_s")
+_NUMBERS: Final = (
+    "hosts", "cycles", "missed", "dropped", "strangers", "cpu_s", "turn_s", "write_s", "decide_s",
+    "decisions", "deciding_s",
+)  # fmt: skip
 
 
 class LoadReader:

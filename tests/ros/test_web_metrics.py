@@ -43,7 +43,7 @@ def test_a_scrape_has_the_present_and_the_events_since_the_start(cluster):
         assert 'rosrm_events_total{kind="finished"} 0.0' in lines
 
         wait_until(
-            lambda: b"\nrosrm_journal_write_seconds " in web.ask("/metrics").body,
+            lambda: b"\nrosrm_decision_seconds " in web.ask("/metrics").body,
             "the load of the master has arrived",
         )
         cluster.run(job("short", "true"))

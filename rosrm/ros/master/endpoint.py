@@ -22,6 +22,7 @@ from rosrm.keys.security import Authority
 from rosrm.ros import names, qos
 from rosrm.ros.introductions import ticket_version
 from rosrm.ros.master.handoff import HandoffEndpoint
+from rosrm.ros.master.load import MasterLoad
 from rosrm.ros.master.refusals import Refusals
 from rosrm.ros.master.rivals import RivalWatch
 from rosrm.ros.master.services import MasterIdentity, MasterServices, Queries
@@ -45,6 +46,7 @@ class MasterEndpoint:
         services: answers requests of slaves and clients.
         handoffs: exchanges messages with nodes of handoffs.
         rivals: finds another master.
+        load: takes the durations of the runtime's work.
         incarnation: random number of this run of the master.
     """
 
@@ -58,7 +60,7 @@ class MasterEndpoint:
         self.events: list[happened.Event] = []
         self.incarnation = identity.incarnation
         refuse = Refusals(self.events.append)
-        strangers = Strangers(refuse)
+        self._strangers = strangers = Strangers(refuse)
         endpoints.refused = strangers.note
         self._security = security
         self.links = HostLinks(
@@ -91,7 +93,7 @@ class MasterEndpoint:
         self._loads = endpoints.announcer(msg.Event, path(names.MASTER_LOAD), qos.LOAD)
         self._load_at = 0.0
         self._oldest: list[float] = []
-        self._longest_turn = self._longest_write = 0.0
+        self.load = MasterLoad()
 
     def shut_revoked(self) -> None:
         """End the conversations with slaves whose key is no longer valid."""
@@ -107,14 +109,6 @@ class MasterEndpoint:
         if readings is not None:
             # Placed first, because a usage must not be judged by readings older than it.
             self.events.insert(0, readings)
-
-    def note_turn(self, seconds: float) -> None:
-        """Note the duration of a turn of the master's loop, for its load."""
-        self._longest_turn = max(self._longest_turn, seconds)
-
-    def note_write(self, seconds: float) -> None:
-        """Note the duration of a write of the journal, for the master's load."""
-        self._longest_write = max(self._longest_write, seconds)
 
     def take_events(self) -> list[happened.Event]:
         """Return the events since the last call, in order, preceded by the newest readings."""
@@ -152,10 +146,9 @@ class MasterEndpoint:
         oldest, self._oldest = self._oldest, []
         facts = {
             "hosts": hosts, "cycles": stats.cycles, "missed": stats.missed,
-            "cpu_s": time.process_time(), "oldest_reading_s": [round(age, 4) for age in oldest],
-            "turn_s": round(self._longest_turn, 6), "write_s": round(self._longest_write, 6),
+            "oldest_reading_s": [round(age, 4) for age in oldest],
+            "dropped": self._guard.dropped, "strangers": self._strangers.total, **self.load.take(),
         }  # fmt: skip
-        self._longest_turn = self._longest_write = 0.0
         self._loads.publish(
             msg.Event(
                 wall_time=time.time(), elapsed=uptime, kind="load", data=json.dumps(facts),

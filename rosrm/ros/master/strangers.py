@@ -49,6 +49,11 @@ class Strangers:
                 f"{messages} without a valid key on {topic}; nothing was done",
             )  # fmt: skip
 
+    @property
+    def total(self) -> int:
+        """Return the number of all messages."""
+        return sum(count.total for count in self._counts.values())
+
     def sentence(self) -> str:
         """Return a sentence about the messages of the last hour; "": there was none."""
         now = time.monotonic()

@@ -30,7 +30,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.events import OrderOutcome
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.migration import failover, handoff
+from rosrm.core.master.migration import blackout, failover, handoff
 from rosrm.core.master.migration.steps import begin, outcome_of, title
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
 from rosrm.core.master.state.migration import End, Migration
@@ -104,6 +104,7 @@ def _advance(state: MasterState, migration: Migration, now: float) -> bool:
         return True
     if not begin(state, migration, step, now):
         return False
+    blackout.note_begun(migration, step, now)
     outcome = outcome_of(state, migration, step, now)
     if outcome is StepProgress.PENDING:
         return False
@@ -136,6 +137,7 @@ def _done(state: MasterState, migration: Migration, step: Step, now: float) -> N
         now, EventKind.MIGRATION_STEP, f"{migration.process}: {what}", process=migration.process,
         facts={"step": title(step), "back": migration.undo is not None},
     )  # fmt: skip
+    blackout.note_done(migration, step, now)
     process = state.processes[migration.process]
     if isinstance(step, Commit):
         _commit(state, migration, step, now)
@@ -312,6 +314,7 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
     durations = {
         name: result["seconds"] for name, result in migration.results.items() if "seconds" in result
     }
+    silent = blackout.seconds(migration)
     state.record(
         now, kind, message, process=migration.process,
         host=(migration.destination_host if moved else migration.source_host).name,
@@ -319,6 +322,7 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
             "from": migration.source_host.name, "to": migration.destination_host.name,
             "seconds": now - migration.started, "cause": migration.cause,
             "strategy": migration.strategy, "parts": durations,
+            **({} if silent is None else {"blackout": silent}),
         },
     )  # fmt: skip
     if kind is EventKind.STAYED and process.decision and process.decision["kind"] == "migrated":

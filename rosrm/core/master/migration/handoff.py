@@ -14,6 +14,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration import blackout
 from rosrm.core.master.outcomes import (
     StepFailed,
     StepOutcome,
@@ -163,6 +164,7 @@ def _note(
         return
     reports = migration.handoff_reports.setdefault(event.instance, HandoffReports())
     if event.phase not in reports.phases:
+        blackout.note_reported(migration, event.phase, now)
         # The message of SHADOWING belongs to the wait that has just ended. Only the text of a
         # time-out shows it.
         is_news = event.message and event.phase is not ReportPhase.SHADOWING

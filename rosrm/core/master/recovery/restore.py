@@ -197,6 +197,7 @@ def _restore_move(
     except (KeyError, TypeError, ValueError) as fault:
         _discard_migration(state, process, move, str(fault), now)
         return False
+    restored.is_timed = False
     process.owner = int(item["owner"])
     state.migrations[process.name] = restored
     if not restored.committed and restored.source.number not in state.instances:

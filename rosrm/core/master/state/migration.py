@@ -76,6 +76,8 @@ class Migration:
             the commit; None: both have one spec.
         source_devices: devices that the source holds; they stay reserved until the commit or the
             end of the undo, because the source may be started again.
+        silent_at, active_at: begin and end of the blackout; None: it has not begun, or ended.
+        is_timed: this master has seen all of the migration.
         aim: purpose of the plan. Source and destination of a checkpoint or restore are on one host.
     """
 
@@ -112,6 +114,9 @@ class Migration:
     aim: Aim = Aim.MOVE
     source_devices: tuple[HeldDevice, ...] = ()
     spec: ProcessSpec | None = None
+    silent_at: float | None = None
+    active_at: float | None = None
+    is_timed: bool = True
     plain_plan: Plain = field(init=False)
 
     def __post_init__(self) -> None:

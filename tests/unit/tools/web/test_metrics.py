@@ -45,7 +45,10 @@ def event(kind, process="talker", wall=0.0, **facts):
 
 RESOURCES = (resource("memory", 0.4), resource("cpu", 0.9, stale=True))
 HOST = HostRow(HostDescription("alpha", 7), 1, "up", False, True, True, 0.1, RESOURCES, 1)
-LOAD = {"turn_s": 0.02, "write_s": 0.01, "cpu_s": 5, "oldest_reading_s": 0.2, "missed": 3}
+LOAD = {
+    "turn_s": 0.02, "write_s": 0.01, "cpu_s": 5, "oldest_reading_s": 0.2, "missed": 3,
+    "decide_s": 0.004, "decisions": 9, "deciding_s": 0.01, "dropped": 1, "strangers": 2,
+}  # fmt: skip
 OWN = [(table.TOKENS, (), 0.0)]
 LISTING = Listing(
     "lab", 60.0, 9, hosts=[HOST],
@@ -89,7 +92,7 @@ def test_the_page_has_the_table():
 def test_the_text_has_every_metric_with_the_labels_of_the_table():
     """Nothing that the table does not have, and nothing of it is missing."""
     counted = counting.EventMetrics()
-    counted.count([event(EventKind.MIGRATED, strategy="relaunch", seconds=2.0)])
+    counted.count([event(EventKind.MIGRATED, strategy="relaunch", seconds=2.0, blackout=0.5)])
     families = {
         family.name: family
         for family in text_string_to_metric_families(
@@ -167,10 +170,12 @@ def test_waits_and_starts_are_timed_by_events():
 
 
 def test_migrations_are_counted_by_strategy_and_outcome():
-    """A migration that stayed has no duration."""
+    """A migration that stayed has no duration, and not each has a known blackout."""
     counted = counting.EventMetrics()
     counted.count([
-        event(EventKind.MIGRATED, strategy="relaunch", seconds=2.0),
+        event(EventKind.MIGRATED, strategy="relaunch", seconds=2.0, blackout=0.0),
+        event(EventKind.MIGRATED, strategy="criu", seconds=3.0, blackout=0.25),
+        event(EventKind.MIGRATED, strategy="criu", seconds=3.0),
         event(EventKind.STAYED, strategy="relaunch", seconds=9.0),
     ])  # fmt: skip
     found = values(exposition(None, 0.0, counted))
@@ -178,6 +183,9 @@ def test_migrations_are_counted_by_strategy_and_outcome():
     assert found["rosrm_migrations_total", "relaunch", "moved"] == 1.0
     assert found["rosrm_migrations_total", "relaunch", "stayed"] == 1.0
     assert found["rosrm_migration_seconds_sum", "relaunch"] == 2.0
+    assert found["rosrm_migration_seconds_count", "criu"] == 2.0
+    assert found["rosrm_migration_blackout_seconds_count", "criu"] == 1.0
+    assert found["rosrm_migration_blackout_seconds_sum", "criu"] == 0.25
     assert found["rosrm_events_total", "host_lost"] == 0.0
 
 

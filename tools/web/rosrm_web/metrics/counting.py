@@ -20,6 +20,7 @@ MOST_TIMED: Final = 10_000
 #: Label of strategies and kinds of events that have none of their own.
 OTHER: Final = "other"
 _BUCKETS: Final = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
+_BLACKOUT_BUCKETS: Final = (0.0, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
 _KINDS: Final = frozenset(kind.value for kind in EventKind)
 _OUTCOMES: Final = {EventKind.MIGRATED.value: "moved", EventKind.STAYED.value: "stayed"}
 
@@ -64,6 +65,7 @@ class EventMetrics:
             self._events.labels(kind.value)
         self._migrations = self._counter(table.MIGRATIONS)
         self._migration_time = self._histogram(table.MIGRATION_TIME)
+        self._blackout = self._histogram(table.BLACKOUT, _BLACKOUT_BUCKETS)
         self._strategies: set[str] = set()
         gone = (EventKind.CANCELLED, EventKind.FAILED, EventKind.PRUNED)
         queued = (EventKind.SUBMITTED, EventKind.QUEUED)
@@ -76,9 +78,9 @@ class EventMetrics:
     def _counter(self, metric: table.Metric) -> Counter:
         return Counter(metric.name, metric.meaning, metric.labels, registry=self.registry)
 
-    def _histogram(self, metric: table.Metric) -> Histogram:
+    def _histogram(self, metric: table.Metric, buckets: tuple[float, ...] = _BUCKETS) -> Histogram:
         return Histogram(
-            metric.name, metric.meaning, metric.labels, registry=self.registry, buckets=_BUCKETS
+            metric.name, metric.meaning, metric.labels, registry=self.registry, buckets=buckets
         )
 
     def count(self, events: Iterable[EventRow]) -> None:
@@ -99,6 +101,9 @@ class EventMetrics:
         self._strategies.add(strategy)
         outcome = _OUTCOMES[event.kind]
         self._migrations.labels(strategy, outcome).inc()
-        seconds = event.facts.get("seconds")
-        if outcome == "moved" and isinstance(seconds, (int, float)):
-            self._migration_time.labels(strategy).observe(seconds)
+        if outcome != "moved":
+            return
+        for fact, histogram in (("seconds", self._migration_time), ("blackout", self._blackout)):
+            seconds = event.facts.get(fact)
+            if isinstance(seconds, (int, float)):
+                histogram.labels(strategy).observe(seconds)

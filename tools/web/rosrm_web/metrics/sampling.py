@@ -21,7 +21,9 @@ Sample = tuple["Metric", tuple[str, ...], float]
 MOST_PROCESSES: Final = 2000
 _OF_LOAD: Final = {
     "turn_s": table.TURN, "write_s": table.WRITE, "cpu_s": table.MASTER_CPU,
-    "oldest_reading_s": table.OLDEST, "missed": table.MISSED,
+    "oldest_reading_s": table.OLDEST, "missed": table.MISSED, "decide_s": table.DECISION,
+    "decisions": table.DECISIONS, "deciding_s": table.DECIDING, "dropped": table.DROPPED,
+    "strangers": table.STRANGERS,
 }  # fmt: skip
 _ENDED: Final = frozenset({"finished", "failed", "cancelled"})
 

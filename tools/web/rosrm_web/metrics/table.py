@@ -49,6 +49,25 @@ MISSED: Final = Metric(
     "rosrm_missed_cycles", "gauge", (),
     "cycles of slaves whose messages did not arrive, since the start of the master",
 )  # fmt: skip
+DECISION: Final = Metric(
+    "rosrm_decision_seconds", "gauge", (),
+    "longest decision of the master on one event within a second",
+)  # fmt: skip
+DECISIONS: Final = Metric(
+    "rosrm_decisions", "gauge", (), "decisions since the start of the master"
+)  # fmt: skip
+DECIDING: Final = Metric(
+    "rosrm_deciding_seconds", "gauge", (),
+    "duration of all decisions since the start of the master",
+)  # fmt: skip
+DROPPED: Final = Metric(
+    "rosrm_dropped_messages", "gauge", (),
+    "messages that the master dropped, because their handling failed, since its start",
+)  # fmt: skip
+STRANGERS: Final = Metric(
+    "rosrm_stranger_messages", "gauge", (),
+    "messages to the master and its slaves without a valid key, since the start of the master",
+)  # fmt: skip
 TROUBLE: Final = Metric(
     "rosrm_master_trouble", "gauge", (),
     "1: the master accepts no new work, for example in a journal stall",
@@ -112,6 +131,10 @@ MIGRATION_TIME: Final = Metric(
     "rosrm_migration_seconds", "histogram", ("strategy",),
     "duration of migrations that moved a process",
 )  # fmt: skip
+BLACKOUT: Final = Metric(
+    "rosrm_migration_blackout_seconds", "histogram", ("strategy",),
+    "time in a migration in which neither source nor destination was active",
+)  # fmt: skip
 WAIT: Final = Metric(
     "rosrm_queue_wait_seconds", "histogram", (), "time from the queue to the choice of a host"
 )
@@ -125,8 +148,9 @@ TOKENS: Final = Metric(
 
 #: Metrics of the present, and metrics that events count.
 PRESENT: Final = (
-    UP, UPTIME, ANSWER, TURN, WRITE, MASTER_CPU, OLDEST, MISSED, TROUBLE, SEQUENCE,
+    UP, UPTIME, ANSWER, TURN, WRITE, MASTER_CPU, OLDEST, MISSED, DECISION, DECISIONS,
+    DECIDING, DROPPED, STRANGERS, TROUBLE, SEQUENCE,
     HOSTS, HOST_UP, HOST_CORDONED, HOST_AGE, HOST_PROCESSES, USAGE, IN_FLIGHT, LIMIT, CAPACITY,
     PROCESSES, QUEUE, QUEUE_AGE, CPU, MEMORY, RESTARTS, LEFT_OUT, APPLICATIONS, PLUGINS, TOKENS,
 )  # fmt: skip
-COUNTED: Final = (EVENTS, MIGRATIONS, MIGRATION_TIME, WAIT, START)
+COUNTED: Final = (EVENTS, MIGRATIONS, MIGRATION_TIME, BLACKOUT, WAIT, START)
