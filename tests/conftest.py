@@ -23,11 +23,12 @@ from tests.criu_kit import criu, theatre  # noqa: F401 - fixtures of several lay
 
 HERE = Path(__file__).parent
 
-#: Whose tests make labs, in two groups: each runs on one worker, so that no more than two labs take
-#: memory and CPU at once. The second group measures, on labs that each take a minute.
-LABS = {
+#: Tests that take much memory and CPU, in groups: each runs on one worker, so that no more than two
+#: labs and one browser run at once. The benchmarks measure, on labs that each take a minute.
+GROUPS = {
     "labs": ("tests/integration/lab/",),
     "benchmarks": ("tests/integration/test_chaos.py", "tests/integration/test_paper.py"),
+    "browser": ("tests/ros/test_web_page.py", "tests/ros/test_web_tree_page.py"),
 }
 
 # By default DDS multicasts on every interface: what a test starts stays on this machine.
@@ -99,7 +100,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def unit_of_work(nodeid: str) -> str:
     """Return the name of the tests that run one after the other on one worker."""
-    for name, places in LABS.items():
+    for name, places in GROUPS.items():
         if nodeid.startswith(places):
             return name
     file = nodeid.partition("::")[0]

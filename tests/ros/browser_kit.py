@@ -48,6 +48,10 @@ def tab(browser: Any, url: str, **options: Any) -> Iterator[Any]:
     try:
         page.goto(url)
         yield page
+    except Exception:
+        print(f"the page shows:\n{page.locator('body').inner_text()}\nits errors: {errors}")
+        raise
+    else:
         assert outside == []
         assert errors == []
     finally:

@@ -108,6 +108,15 @@ def test_a_change_appears_without_a_reload(page, cluster):
     page.locator(".ag-row:visible", has_text="late").filter(has_text="cancelled").wait_for()
 
 
+def test_a_change_is_in_a_tab_that_opens_later(page, cluster):
+    """A browser makes the table of a tab only when it first shows the tab."""
+    cluster.submit(service("vast", "sleep", "9", needs={"memory": 1e15}))
+    page.get_by_role("button", name="2 processes set aside").wait_for()
+    open_tab(page, "Processes")
+    row(page, "vast").wait_for()
+    cluster.cancel("vast")
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_serious_finding_of_an_accessibility_checker(chromium, web, scheme):
     """Names, roles and contrasts of the page, by axe-core."""
@@ -148,8 +157,8 @@ def test_a_token_opens_the_page_and_an_operator_acts(chromium, cluster, tmp_path
 
 
 def act(page: Any, action: str, warning: str) -> None:
-    """Press the button of an action, and then that of the question with this warning."""
-    page.get_by_role("button", name=action, exact=True).click()
+    """Press the button of an action twice, and then that of the one question with this warning."""
+    page.get_by_role("button", name=action, exact=True).evaluate("it => { it.click(); it.click() }")
     question = page.get_by_role("dialog").filter(has_text=warning)
     question.get_by_role("button", name=action, exact=True).click()
     question.wait_for(state="hidden")

@@ -12,6 +12,9 @@ from tests.ros.browser_kit import browser, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import gateway
 
+#: As in test_web_page.py.
+pytestmark = pytest.mark.timeout(600)
+
 
 @pytest.fixture(scope="module")
 def cluster(make_shared) -> Cluster:

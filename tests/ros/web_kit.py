@@ -155,6 +155,9 @@ def gateway(ros: RosSettings, *words: str, tls: ssl.SSLContext | None = None) ->
     try:
         one.wait_for_address()
         yield one
+    except Exception:
+        print(f"the gateway printed: {one.said}")
+        raise
     finally:
         code = one.end() if one.process.poll() is None else 0
     assert code == 0, one.said

@@ -45,8 +45,8 @@ def test_a_browser_that_cannot_be_updated_stops_no_other():
             if times == 3:
                 seen.set()
 
-        await live.join(broken)
-        await live.join(well)
+        live.join(broken)
+        live.join(well)
         await asyncio.wait_for(seen.wait(), 30.0)
         live.leave(broken)
         live.leave(well)
@@ -60,7 +60,7 @@ def test_nothing_is_read_while_nobody_looks():
 
     async def scene() -> None:
         gateway, live = await started(Master())
-        await live.join(lambda: None)
+        live.join(lambda: None)
         reading = asyncio.all_tasks() - {asyncio.current_task()}
         assert reading
         live.leave(live.on_change[0])

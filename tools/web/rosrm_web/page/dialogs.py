@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -73,6 +74,7 @@ class Dialog:
         self.name = ""
         with ui.dialog() as self.dialog:
             self.card = ui.card().classes("w-full max-w-screen-lg")
+        self._question = ui.dialog()
         with self.card, ui.row().classes("w-full items-center"):
             self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
             ui.space()
@@ -88,8 +90,11 @@ class Dialog:
         self.dialog.open()
 
     async def _confirm(self, action: Action) -> None:
-        name = self.name
-        with ui.dialog() as question, ui.card():
+        name, question = self.name, self._question
+        if question.value:
+            return  # a second press, before the browser shows the question
+        question.clear()
+        with question, ui.card():
             ui.label(action.warning.format(name=name))
             with ui.row():
                 ui.button(action.title, on_click=lambda: question.submit(True)).props("no-caps")
@@ -121,14 +126,22 @@ class ProcessDialog(Dialog):
                     self._why = ui.column().classes("w-full")
                 with ui.tab_panel("logs"):
                     self._log = _Log(gateway)
-        self.dialog.on("hide", self._log.stop)
+        self._explaining: asyncio.Task[None] | None = None
+        self.dialog.on("hide", self.stop)
 
     def open(self, name: str) -> None:
         """Show the process of this name."""
         super().open(name)
+        self.stop()
         self._why.clear()
         self._log.start(name)
-        background_tasks.create(self._explain(name))
+        self._explaining = background_tasks.create(self._explain(name))
+
+    def stop(self) -> None:
+        """Request nothing more; drop what a slow master has not answered."""
+        self._log.stop()
+        if self._explaining is not None:
+            self._explaining.cancel()
 
     async def _explain(self, name: str) -> None:
         gateway = self._gateway
@@ -174,6 +187,7 @@ class _Log:
         self._gateway = gateway
         self._lines: deque[str] = deque(maxlen=_LINES)
         self._reader: LogReader | None = None
+        self._opening: asyncio.Task[None] | None = None
         self._search = ui.input("Show only lines with", on_change=self._show).props(
             "dense clearable"
         )
@@ -184,11 +198,14 @@ class _Log:
         """Show the output of a process from now on."""
         self._lines.clear()
         self._text.clear()
-        background_tasks.create(self._begin(process))
+        self._opening = background_tasks.create(self._begin(process))
 
     def stop(self) -> None:
         """Read no more output."""
         self._timer.deactivate()
+        self._reader = None
+        if self._opening is not None:
+            self._opening.cancel()
 
     async def _begin(self, process: str) -> None:
         try:
@@ -209,7 +226,7 @@ class _Log:
             chunk = await self._gateway.ask(self._gateway.logs, lambda _: reader.poll())
         except RosrmError:
             return  # the header says that the master is lost; the next request may succeed
-        if chunk is not None and chunk.content:
+        if reader is self._reader and chunk is not None and chunk.content:
             self._add(chunk.content.decode(errors="replace"))
 
     def _add(self, text: str) -> None:

@@ -44,19 +44,19 @@ class Live:
         gateway.watcher.on_events.append(self._take_events)
         gateway.watcher.on_master.append(lambda _: self._woken.set())
 
-    async def join(self, on_change: Callable[[], None]) -> None:
+    def join(self, on_change: Callable[[], None]) -> None:
         """Call a function after each change, until `leave`."""
         self.on_change.append(on_change)
+        self._woken.set()
         if self._task is None:
             self._task = asyncio.create_task(self._run())
-            await self._read()
 
     def leave(self, on_change: Callable[[], None]) -> None:
         """End the calls of a function; without any, nothing is read."""
         self.on_change.remove(on_change)
         if not self.on_change and self._task is not None:
             self._task.cancel()
-            self._task = None
+            self._task = self.listing = None
 
     def wake(self) -> None:
         """Read now, because an action may have changed something."""

@@ -24,6 +24,11 @@ if TYPE_CHECKING:
 MOST_PAGES: Final = 32
 #: Seconds after which a page to which no browser has connected makes room for another one.
 _UNUSED: Final = 5.0
+#: Seconds after which the page of an absent browser is dropped. A browser that returns earlier, for
+#: example to its Wi-Fi, keeps its open dialogs and gets all changes.
+_ABSENCE: Final = 30.0
+#: NiceGUI sends a ping after 0.8 of these seconds, and a browser answers within 0.4 of them.
+_PINGS: Final = 15.0
 #: Events in the table.
 _SHOWN_EVENTS: Final = 200
 _STYLE: Final = """
@@ -44,8 +49,9 @@ def mount(app: FastAPI, gateway: Gateway) -> None:
     live = Live(gateway)
     nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
     room = [Depends(partial(_check_room, live))]
-    ui.page("/", title="rosrm", dark=None, dependencies=room)(partial(_page, gateway, live))
-    ui.run_with(app, show_welcome_message=False, language="en-US")
+    page = ui.page("/", title="rosrm", dark=None, reconnect_timeout=_ABSENCE, dependencies=room)
+    page(partial(_page, gateway, live))
+    ui.run_with(app, show_welcome_message=False, language="en-US", reconnect_timeout=_PINGS)
 
 
 async def _check_room(live: Live) -> None:
@@ -56,12 +62,12 @@ async def _check_room(live: Live) -> None:
         raise Busy(f"{MOST_PAGES} pages are open already; close one, or try again later")
 
 
-async def _page(gateway: Gateway, live: Live) -> None:
+def _page(gateway: Gateway, live: Live) -> None:
     client = ui.context.client
     request = client.request
     page = Page(gateway, live, may_act=bool(request.scope["may_act"]))
     client.on_delete(page.leave)
-    await live.join(page.update)
+    live.join(page.update)
     page.update()
 
 
@@ -142,3 +148,4 @@ class Page:
     def leave(self) -> None:
         """End the updates of this browser."""
         self._live.leave(self.update)
+        self._process.stop()

@@ -92,12 +92,23 @@ class Table:
         on_open: Callable[[str], None] | None = None, options: Mapping[str, Any] = EMPTY,
     ) -> None:  # fmt: skip
         self.shown: dict[str, Row] | None = None
-        merged = {**_OPTIONS, **options, "columnDefs": list(columns), "rowData": []}
+        self._is_mounted = False
+        merged = {**_OPTIONS, **options, "columnDefs": list(columns)}
         self.grid = ui.aggrid(merged, theme="quartz", auto_size_columns=False)
         self.grid.classes("w-full rosrm-grid").props(f'aria-label="{label}"')
         self._on_open = on_open
+        self.grid.on("gridReady", self._mount, [])
         self.grid.on("cellDoubleClicked", lambda event: self._open(event.args["data"]["id"]))
         self.grid.on("keydown", lambda event: self.take_key(**event.args), js_handler=_KEYS)
+
+    def _mount(self) -> None:
+        """Send all rows, because a browser makes a grid only when it first shows its tab."""
+        self._is_mounted = True
+        self._send_all()
+
+    def _send_all(self) -> None:
+        if self._is_mounted and self.shown is not None:
+            self.grid.run_grid_method("setGridOption", "rowData", list(self.shown.values()))
 
     def _open(self, row_id: str) -> None:
         if self._on_open is not None:
@@ -110,11 +121,11 @@ class Table:
 
     def show(self, rows: Mapping[str, Row]) -> None:
         """Show rows by their ids."""
-        if self.shown is None:
-            self.grid.options["rowData"] = list(rows.values())
-        elif change := changed(self.shown, rows):
+        before, self.shown = self.shown, dict(rows)
+        if before is None:
+            self._send_all()
+        elif self._is_mounted and (change := changed(before, rows)):
             self.grid.run_grid_method("applyTransaction", change.transaction())
-        self.shown = dict(rows)
 
     def narrow(self, **values: str) -> None:
         """Show only rows with these values of columns; without values, all rows."""
