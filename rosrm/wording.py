@@ -214,8 +214,9 @@ def duration(seconds: float) -> str:
 def reload_summary(changed: Sequence[str], kept: Sequence[str]) -> str:
     """Return a predicate on a reload: the changed settings, and those that need a restart."""
     done = f"reloaded {listed(changed)}" if changed else "no setting to reload has changed"
-    need = "needs" if len(kept) == 1 else "need"
-    return f"{done}; {listed(kept)} {need} a restart, and stay as before" if kept else done
+    one = len(kept) == 1
+    end = "needs a restart, and stays as before" if one else "need a restart, and stay as before"
+    return f"{done}; {listed(kept)} {end}" if kept else done
 
 
 def weighted(name: str, weight: float) -> str:

@@ -99,6 +99,20 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/evaluation.md": "40 minutes; tests/integration/test_paper.py runs its parts",
 }
 
+#: The pages with `text` blocks, and the test that compares their text; in brackets: why none does.
+TEXTS: Final[Mapping[str, str]] = {
+    "docs/explanation/architecture.md": "tests/unit/docs/test_code_map.py",
+    "docs/how-to/artifacts.md": "(a moment of a long transfer) tests/unit/slave/test_artifacts.py",
+    "docs/how-to/health.md": "tests/unit/docs/test_outputs.py",
+    "docs/how-to/lifecycle-nodes.md": "tests/unit/docs/test_outputs.py",
+    "docs/how-to/web.md": "(any events) tests/unit/tools/web/test_changes.py",
+    "docs/how-to/wireguard.md": "(a tunnel between two machines)",
+    "docs/reference/command-line.md": "tests/unit/docs/test_outputs.py",
+    "docs/reference/keys.md": "tests/unit/docs/test_keys_page.py",
+    "docs/reference/metrics.md": "(a file of Prometheus)",
+    "docs/tutorials/your-own-filter.md": "(any host) tests/integration/plugins/test_tutorial.py",
+}
+
 BLOCK: Final = re.compile(
     r"(?:^<!-- (?P<mark>[^\n]*) -->\n)?^```(?P<language>\w+)(?P<info>[^\n]*)\n(?P<text>.*?)^```$",
     re.MULTILINE | re.DOTALL,
@@ -142,11 +156,16 @@ def blocks(page: str) -> Iterator[Block]:
         yield Block(found["language"], title_of(found), known, about, found["text"])
 
 
-def pages_with_commands() -> set[str]:
-    """The names of all pages that show something to type."""
+def texts(page: str) -> list[str]:
+    """Return the `text` blocks of a page."""
+    return [one.text for one in blocks(page) if one.language == "text"]
+
+
+def pages_with(language: str) -> set[str]:
+    """The names of all pages that have a block of a language, such as `console`."""
     every = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *ROOT.glob("*/README.md")]
     names = (str(page.relative_to(ROOT)) for page in every)
-    return {name for name in names if any(one.language == "console" for one in blocks(name))}
+    return {name for name in names if any(one.language == language for one in blocks(name))}
 
 
 def run_examples(page: str, mark: str) -> None:

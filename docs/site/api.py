@@ -65,6 +65,13 @@ def _keep_colon(
         lines[:0] = ["..", ""]
 
 
+def _show_defaults(
+    app: Sphinx, what: str, name: str, value: object, options: object, *shown: str | None
+) -> tuple[str | None, ...]:
+    """Replace default values that are no Python (`<factory>`), so that Sphinx reads the types."""
+    return tuple(text and re.sub(r"<[^<>]+>", "...", text) for text in shown)
+
+
 def _public(
     app: Sphinx, env: BuildEnvironment, node: pending_xref, content: nodes.TextElement
 ) -> nodes.reference | None:
@@ -86,5 +93,6 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Register the directive and the links."""
     app.add_directive("public-names", PublicNames)
     app.connect("autodoc-process-docstring", _keep_colon, priority=400)  # before napoleon
+    app.connect("autodoc-process-signature", _show_defaults)
     app.connect("missing-reference", _public)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

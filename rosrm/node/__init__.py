@@ -1,5 +1,7 @@
 """Base class of migratable nodes: `Node` replaces rclpy's.
 
+Example::
+
     from rosrm.node import Node
 
     class Counter(Node):
