@@ -20,7 +20,7 @@ constexpr std::uint64_t kEpochStep = 1000;
 /// Most messages that are held.
 constexpr std::size_t kMostHeld = 16;
 /// Seconds between two looks if the slave knows the epoch.
-constexpr double kLook = 0.1;
+constexpr double kEarlyLook = 0.1;
 /// Seconds for the author's constructor to name all parts, if it spins first; check interval.
 constexpr double kConstructorPatience = 10.0;
 constexpr double kConstructorLook = 0.02;
@@ -303,7 +303,7 @@ void HandoffSession::hold(const StateConfig & config)
 {
   push_bounded(early_, {config, entities.middleware.now() + patience_.early});
   if (early_alarm_ == 0) {
-    early_alarm_ = entities.alarms.start(kLook, [this] {look_at_early();});
+    early_alarm_ = entities.alarms.start(kEarlyLook, [this] {look_at_early();});
   }
 }
 
