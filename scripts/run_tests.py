@@ -163,6 +163,8 @@ def run_pytest(
     result = RESULTS / f"{name}.xml"
     result.unlink(missing_ok=True)
     command = [
+        # A run with its output in a file runs beside tests in real time: those come first.
+        *(("nice", "-n", "5") if output else ()),
         *(sys.executable, "-m", "pytest", f"--junit-xml={result}", "-o", "junit_logging=all"),
         # Each run has its own list of failed tests: two runs that end at once would lose one.
         *("-o", f"cache_dir=.pytest_cache/{name.removesuffix('-again')}"),

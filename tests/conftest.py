@@ -31,6 +31,9 @@ GROUPS = {
     "browser": ("tests/ros/test_web_page.py", "tests/ros/test_web_tree_page.py"),
 }
 
+#: Tests of a ROS graph that together take as long as a slow one.
+SLOW = 6
+
 # By default DDS multicasts on every interface: what a test starts stays on this machine.
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 
@@ -90,12 +93,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         layer = item.path.relative_to(HERE).parts[0]
         item.add_marker(getattr(pytest.mark, layer))
-    # The longest unit of work comes first, so that no worker has it left at the end: units with a
-    # slow test, then those with the most tests.
+    # The longest unit of work comes first, so that no worker has it left at the end.
     unit_of = {item: unit_of_work(item.nodeid) for item in items}
-    slow = {unit_of[item] for item in items if item.get_closest_marker("slow")}
-    size = Counter(unit_of.values())
-    items.sort(key=lambda item: (unit_of[item] not in slow, -size[unit_of[item]]))
+    length: Counter[str] = Counter()
+    for item in items:
+        length[unit_of[item]] += SLOW if item.get_closest_marker("slow") else 1
+    items.sort(key=lambda item: -length[unit_of[item]])
 
 
 def unit_of_work(nodeid: str) -> str:
