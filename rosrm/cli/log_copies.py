@@ -20,6 +20,7 @@ from rosrm.client.logs import PERIOD, LogReader, LogSelection
 from rosrm.errors import RosrmError
 
 if TYPE_CHECKING:
+    from rosrm.archive.reader import LogArchive
     from rosrm.client.client import Client
 
 
@@ -42,7 +43,10 @@ def time_of(option: str, text: str) -> float:
         return time.time() - seconds_of(option, text, hint=hint)
 
 
-def copy_logs(client: Client, streams: Sequence[LogStream], selection: LogSelection) -> None:
+def copy_logs(
+    client: Client, streams: Sequence[LogStream], selection: LogSelection,
+    archive: LogArchive | None = None,
+) -> None:  # fmt: skip
     """Copy the logs of processes to standard output by the times of their lines; follow all.
 
     An unreachable log is reported at once, and the others are copied.
@@ -50,7 +54,7 @@ def copy_logs(client: Client, streams: Sequence[LogStream], selection: LogSelect
     Raises:
         typer.Exit: a log could not be copied.
     """
-    readers = client.log_readers([stream.name for stream in streams], selection)
+    readers = client.log_readers([stream.name for stream in streams], selection, archive)
     copies = [_Copy(reader, stream) for reader, stream in zip(readers, streams, strict=True)]
     # `merge` takes the earliest of the next pieces. A piece without a time follows its predecessor.
     show(merge(*(copy.begin() for copy in copies), key=itemgetter(0)))

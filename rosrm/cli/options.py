@@ -72,6 +72,14 @@ def seconds_of(
         raise ConfigError(f"{option}: {error}{hint}") from None
 
 
+def size_of(option: str, text: str, *, low: int) -> int:
+    """Return the size of an option in bytes; raises `ConfigError`."""
+    try:
+        return int(Quantity("size", low=low, whole=True).parse(text))
+    except ValueError as error:
+        raise ConfigError(f"{option}: {error}. Give a size, e.g. 20GB") from None
+
+
 def pairs_of(option: str, words: Iterable[str], form: str) -> dict[str, str]:
     """Return the values of a repeated option by their names; the last of a name counts.
 

@@ -18,6 +18,7 @@ from rosrm.model.values import ProcessSpec
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+    from rosrm.archive.reader import LogArchive
     from rosrm.client.logs import LogChunk, LogReader, LogSelection
     from rosrm.client.waiting import OnChange, Until, WaitResult
     from rosrm.model.applications import ApplicationRow, ApplyResult
@@ -385,13 +386,19 @@ class Client:
             elif not reader.at_end:
                 time.sleep(logs.PERIOD)
 
-    def log_readers(self, processes: Sequence[str], selection: LogSelection) -> Sequence[LogReader]:
-        """Return a reader for the log of each process; all of them ask a silent host once."""
+    def log_readers(
+        self, processes: Sequence[str], selection: LogSelection, archive: LogArchive | None = None
+    ) -> Sequence[LogReader]:
+        """Return a reader for the log of each process; all of them ask a silent host once.
+
+        With an archive they also read the collected logs of hosts that are gone.
+        """
         from rosrm.client.logs import LogReader  # noqa: PLC0415 - as above
 
         silent: dict[str, str] = {}
         return [
-            LogReader(self._master, name, selection, self._notify, silent) for name in processes
+            LogReader(self._master, name, selection, self._notify, silent, archive)
+            for name in processes
         ]
 
     # --- waiting -------------------------------------------------------------------------

@@ -1,15 +1,19 @@
-"""Reader of process logs, which the slaves hold: finds, copies and follows them.
+"""Reader of process logs: finds, copies and follows them.
 
-The numbers of instances increase over all hosts, so they order the output of a process.
+The slaves hold the logs. A log archive has copies, which are read for hosts that are gone, and for
+instances whose logs the slave has removed. The numbers of instances increase over all hosts, so
+they order the output of a process.
 """
 
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
+from rosrm.archive.reader import LogArchive
 from rosrm.client.connecting import check_name
 from rosrm.client.retrying import Notify
 from rosrm.client.waiting import ENDED
@@ -82,6 +86,7 @@ class LogReader:
         selection: of the log.
         notify: takes messages about unreachable parts, and about a log without output.
         silent: hosts that did not answer, with the error; readers that share it ask each once.
+        archive: of collected logs; None: there is none.
         at_end: no more output can follow.
     """
 
@@ -90,6 +95,7 @@ class LogReader:
     selection: LogSelection
     notify: Notify
     silent: dict[str, str] = field(default_factory=dict)
+    archive: LogArchive | None = None
     at_end: bool = False
     _host: str = ""
     _number: int = 0
@@ -98,6 +104,7 @@ class LogReader:
     _started: bool = False
     _hosts: Sequence[str] = ()
     _away: dict[str, str] = field(default_factory=dict)
+    _archived: set[tuple[str, int]] = field(default_factory=set)
 
     def read(self) -> Iterator[LogChunk]:
         """Yield the existing output, the oldest first; raises `RosrmError`."""
@@ -160,6 +167,10 @@ class LogReader:
         self, host: str, number: int, offset: int, most: int = _PART, *, tail: int = 0,
         since: float = 0.0,
     ) -> LogPart:  # fmt: skip
+        if self.archive is not None and (host, number) in self._archived:
+            return self.archive.read_log(
+                host, self.process, number, offset, most, tail=tail, since=since
+            )
         if host not in self.silent:
             try:
                 return self.master.read_log(
@@ -186,12 +197,13 @@ class LogReader:
     def _find(self) -> list[tuple[str, int]]:
         """Return host and number of every instance within reach, the oldest first."""
         row, hosts, events = self._ask()
-        check_name("host", self.selection.host, hosts)
+        collected = self.archive.hosts_of(self.process) if self.archive is not None else ()
+        check_name("host", self.selection.host, [*hosts, *collected])
         if self.selection.host:
             names = [self.selection.host]
         else:
             here = [row.host] if row is not None and row.host else []
-            names = list(dict.fromkeys([*here, *(host for host in events if host)]))
+            names = list(dict.fromkeys([*here, *filter(None, events), *collected]))
         if not names and row is None:
             known = self.master.list(processes=True).processes
             raise Refused(
@@ -199,18 +211,42 @@ class LogReader:
             )
         owner = row.host if row is not None and not self.selection.host else self.selection.host
         self._hosts = names
-        self._away = {host: away for host in names if (away := _why_away(hosts.get(host), host))}
-        if owner in self._away:
+        self._away = {
+            host: away for host in names
+            if (away := _why_away(hosts.get(host), host, is_listed=bool(hosts)))
+        }  # fmt: skip
+        if owner in self._away and owner not in collected:
             self._refuse(row, owner)
         found = []
         for host in names:
             if host not in self._away:
-                found += [(host, number) for number in self._numbers(host, owner)]
-        for away in self._away.values():
-            self.notify(f"{self.process}: part of its log cannot be read: {away}")
+                must_answer = host == owner and host not in collected
+                found += [(host, number) for number in self._numbers(host, must_answer)]
+        for host in collected if self.archive is not None else ():
+            found += self._find_collected(host, found)
+        for host, away in self._away.items():
+            if host not in collected:
+                self.notify(f"{self.process}: part of its log cannot be read: {away}")
         return sorted(found, key=lambda one: one[1])
 
-    def _numbers(self, host: str, owner: str) -> Sequence[int]:
+    def _find_collected(
+        self, host: str, found: Sequence[tuple[str, int]]
+    ) -> Sequence[tuple[str, int]]:
+        """Return the instances on a host whose logs only the archive has."""
+        assert self.archive is not None
+        if self.selection.host not in {"", host}:
+            return ()
+        only = {(host, number) for number in self.archive.numbers(host, self.process)} - {*found}
+        self._archived |= only
+        if host in self._away:
+            until = self.archive.collected_until(host, self.process)
+            self.notify(
+                f"{self.process}: {self._away[host]}. Its output there is read from "
+                f"{self.archive.directory}, as collected until {_clock(until)}"
+            )
+        return sorted(only)
+
+    def _numbers(self, host: str, must_answer: bool) -> Sequence[int]:
         """Return the numbers of the instances whose logs a host holds."""
         try:
             part = self._read(host, 0, 0, 1)
@@ -219,7 +255,7 @@ class LogReader:
                 raise
             return ()
         except NoMaster:
-            if host == owner:
+            if must_answer:
                 raise
             self._away[host] = self.silent[host]
             return ()
@@ -291,6 +327,10 @@ def _up_to(end: int, part: LogPart) -> LogPart:
     return replace(part, content=part.content[: end - part.offset], next_offset=end)
 
 
+def _clock(when: float) -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(when))
+
+
 def _hosts_of(listed: Listing) -> list[str]:
     """Return the hosts that the events of a process name, the newest first."""
     hosts: list[str] = []
@@ -299,8 +339,10 @@ def _hosts_of(listed: Listing) -> list[str]:
     return hosts
 
 
-def _why_away(row: HostRow | None, host: str) -> str:
+def _why_away(row: HostRow | None, host: str, *, is_listed: bool) -> str:
     """Return why a host cannot be asked; "" if it can."""
+    if not is_listed:
+        return f"no master lists {host}"
     if row is None:
         return f"the master knows no host {host}"
     if row.state == "up":

@@ -26,7 +26,7 @@ from rosrm.ros import convert, names
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.control import ControlClient, check_answer
 from rosrm.ros.deferred_signals import signals_deferred
-from rosrm.ros.introductions import introduction_of, introduction_request
+from rosrm.ros.introductions import Introduction, introduction_of, introduction_request
 from rosrm.ros.load_reader import LoadReader
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
@@ -49,6 +49,8 @@ _AGAIN: Final = 2.0
 _GREET_AGAIN: Final = 0.5
 #: Epoch in an answer that does not name the master's run.
 _UNKNOWN_EPOCH: Final = 0
+#: Tickets that are kept until expired ones are removed.
+_MOST_INTRODUCTIONS: Final = 1000
 #: Name of the master in messages.
 _MASTER: Final = "the master"
 
@@ -207,14 +209,6 @@ def _to_check(settings: RosSettings) -> str:
     return f"Is {master}?"
 
 
-@dataclass(slots=True)
-class _Slave:
-    """Client of a slave, and the monotonic second until which its ticket is used."""
-
-    client: SealedClient
-    until: float = -math.inf
-
-
 class MasterClient:
     """A connection to the master; a context manager.
 
@@ -233,7 +227,8 @@ class MasterClient:
         self._names = names.Names(participant.settings.namespace)
         self._control = ControlClient(participant, f"client {name}")
         self._clients: dict[str, SealedClient] = {}
-        self._slaves: dict[tuple[str, str], _Slave] = {}
+        self._log_clients: dict[str, SealedClient] = {}
+        self._introductions: dict[tuple[str, str], Introduction] = {}
         self._load: LoadReader | None = None
 
     @classmethod
@@ -505,22 +500,35 @@ class MasterClient:
         """Send a request for a log to a slave, with a ticket."""
         who = f"the slave of {host}"
         for is_repeated in (False, True):
-            slave = self._introduced(host, process)
-            self._discover(slave.client, who)
+            client = self._introduced(host, process)
+            self._discover(client, who)
             try:
-                return self._answered(slave.client, srv.ReadLog, request, who)
+                return self._answered(client, srv.ReadLog, request, who)
             except Refused as refusal:
                 if is_repeated or refusal.code != "stale":
                     raise
-                slave.until = -math.inf  # the slave has restarted: its ticket has the former run
+                del self._introductions[host, process]  # of the former run: the slave has restarted
         raise AssertionError("the second request is answered, or refused")
 
-    def _introduced(self, host: str, process: str) -> _Slave:
-        """Return the client of a slave for the logs of a process, with a valid ticket."""
+    def _introduced(self, host: str, process: str) -> SealedClient:
+        """Return the client of a slave, with a valid ticket for the logs of a process."""
+        known = self._introductions.get((host, process))
+        if known is None or time.monotonic() >= known.until:
+            known = self._introductions[host, process] = self._introduce(host, process)
+        client = self._log_clients.get(host)
+        if client is None:
+            path = self._names.of_host(host, names.READ_LOG)
+            client = self._log_clients[host] = self._endpoints.client(
+                srv.ReadLog, path, known.slave
+            )
+        client.peer = known.slave
+        return client
+
+    def _introduce(self, host: str, process: str) -> Introduction:
         now = time.monotonic()
-        known = self._slaves.get((host, process))
-        if known is not None and now < known.until:
-            return known
+        if len(self._introductions) >= _MOST_INTRODUCTIONS:
+            known = self._introductions.items()
+            self._introductions = {at: one for at, one in known if now < one.until}
         request = introduction_request(host, names.READ_LOG, process)
         try:
             response = self._call(srv.Introduce, names.INTRODUCE, request)
@@ -528,13 +536,7 @@ class MasterClient:
             if refusal.code != "silent":
                 raise
             raise NoMaster(f"{refusal}. Is `rosrm slave` running there?") from refusal
-        slave, until = introduction_of(response, self._endpoints.security, now)
-        if known is None:
-            path = self._names.of_host(host, names.READ_LOG)
-            known = _Slave(self._endpoints.client(srv.ReadLog, path, slave))
-            self._slaves[host, process] = known
-        known.client.peer, known.until = slave, until
-        return known
+        return introduction_of(response, self._endpoints.security, now)
 
     def _call(
         self, kind: Any, name: str, request: Any, patience: float = 0.0,

@@ -1,4 +1,4 @@
-"""Commands about the output of processes: logs."""
+"""Commands about the output of processes: logs, collect-logs."""
 
 # Each command imports its modules when it runs, so that `rosrm --help` is quick.
 # ruff: noqa: PLC0415
@@ -6,19 +6,35 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Annotated, Final
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final, cast
 
 import typer
 
 from rosrm.cli import completion, connection
-from rosrm.cli.options import Application, Domain
+from rosrm.cli.options import Application, CommonOptions, Domain
 from rosrm.errors import ConfigError, Refused
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from rosrm.archive.reader import LogArchive
     from rosrm.cli.output.log_search import LineSearch
     from rosrm.client.client import Client
+    from rosrm.ros.master_connection import MasterClient
+
+
+Archive = Annotated[
+    Path | None,
+    typer.Option(
+        "--archive",
+        metavar="DIR",
+        envvar="ROSRM_LOG_ARCHIVE",
+        help="Directory of `rosrm collect-logs`, for the output of hosts that are gone.",
+    ),
+]
 
 
 def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
@@ -87,12 +103,15 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
         bool,
         typer.Option("--raw", help="Print colours and other control characters in a terminal too."),
     ] = False,
+    archive: Archive = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print each line as a JSON object.")
     ] = False,
     domain: Domain = None,
 ) -> None:
     """Print the output of processes, from all hosts.
+
+    With a log archive, the output of hosts that are gone is printed too.
 
     The output is complete over restarts and moves. Where the size limit of logs dropped output, a
     line gives the dropped size. In a terminal, lines have the colour of their level, and control
@@ -110,7 +129,8 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
         coloured=not is_plain and not os.environ.get("NO_COLOR"),
     )  # fmt: skip
     selection = LogSelection(tail or 0, time_of("--since", since), host, follow)
-    with connection.master(ctx, domain) as client:
+    collected = open_archive(archive)
+    with _client(ctx, domain, has_archive=collected is not None) as client:
         chosen = _names(client, names or (), app)
         width = max(map(len, chosen)) if len(chosen) > 1 else 0
         streams = [
@@ -119,7 +139,7 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
             )
             for name in chosen
         ]
-        copy_logs(client, streams, selection)
+        copy_logs(client, streams, selection, collected)
 
 
 def _search(
@@ -149,4 +169,79 @@ def _names(client: Client, names: Sequence[str], app: str) -> Sequence[str]:
     return found
 
 
-COMMANDS: Final = (logs,)
+def open_archive(directory: Path | None) -> LogArchive | None:
+    """Open the log archive of a command, if one is given; raises `Refused`."""
+    from rosrm.archive.reader import LogArchive
+
+    return None if directory is None else LogArchive(directory)
+
+
+@contextmanager
+def _client(ctx: typer.Context, domain: int | None, *, has_archive: bool) -> Iterator[Client]:
+    """Create a client of the master; with an archive, the master may be gone."""
+    from rosrm.client.client import Client
+    from rosrm.client.no_master import NoConnection
+    from rosrm.errors import NoMaster
+
+    with ExitStack() as closing:
+        try:
+            client = closing.enter_context(connection.master(ctx, domain))
+        except NoMaster as error:
+            if not has_archive:
+                raise
+            connection.note(f"{error} Only collected logs are printed")
+            nobody = cast("MasterClient", NoConnection())
+            client = Client(connection=nobody, notify=connection.note)
+        yield client
+
+
+def collect_logs(  # noqa: PLR0917 - an argument for each option
+    ctx: typer.Context,
+    directory: Annotated[
+        Path, typer.Argument(metavar="DIR", help="Directory of the log archive, of one cluster.")
+    ],
+    every: Annotated[
+        str,
+        typer.Option(
+            "--every",
+            metavar="TIME",
+            help="Time between two requests for a log with new output, e.g. 5s.",
+        ),
+    ] = "2s",
+    keep: Annotated[
+        str,
+        typer.Option(
+            "--keep", metavar="SIZE", help="Most bytes of the archive; the oldest are removed."
+        ),
+    ] = "20GB",
+    keep_host: Annotated[
+        str,
+        typer.Option("--keep-host", metavar="SIZE", help="Most bytes of the logs of one host."),
+    ] = "5GB",
+    max_rate: Annotated[
+        str,
+        typer.Option("--max-rate", metavar="SIZE", help="Most bytes per second, e.g. 1MB."),
+    ] = "5MB",
+    domain: Domain = None,
+) -> None:
+    """Copy the output of all processes into a log archive until Ctrl-C.
+
+    `rosrm logs --archive DIR` reads the archive when a host is gone. The command continues where it
+    stopped, also after it was killed.
+    """
+    from rosrm.archive.retention import ArchiveLimits
+    from rosrm.cli.collecting import collect
+    from rosrm.cli.options import seconds_of, size_of
+
+    limits = ArchiveLimits(
+        size_of("--keep", keep, low=1_000_000), size_of("--keep-host", keep_host, low=1_000_000)
+    )
+    cluster = ctx.obj.cluster if isinstance(ctx.obj, CommonOptions) else None
+    collect(
+        directory, limits, connection.ros_settings(ctx, domain), cluster,
+        every=seconds_of("--every", every, low=0.1, above=False),
+        rate=size_of("--max-rate", max_rate, low=1000),
+    )  # fmt: skip
+
+
+COMMANDS: Final = (logs, collect_logs)

@@ -1,0 +1,321 @@
+"""Collection of logs into an archive: each byte once, whatever is rotated, killed or lost."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import shutil
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import hypothesis.strategies as st
+import pytest
+from hypothesis import settings
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
+
+from rosrm.archive import writer
+from rosrm.archive.reader import LogArchive
+from rosrm.archive.retention import ArchiveLimits
+from rosrm.client import log_collection
+from rosrm.model.rows import LogPart
+from tests.unit.archive.rig import HOST, PROCESS, Rig
+from tests.unit.cli.conftest import host, process
+
+
+class Crash(BaseException):
+    """The collector is killed."""
+
+
+class Shipping(RuleBasedStateMachine):
+    """A process writes, its log is rotated, and a collector is killed and started at any moment.
+
+    Its segments and requests are tiny, so that most steps begin, close or continue one.
+    """
+
+    @initialize()
+    def begin(self):
+        self.folder = Path(tempfile.mkdtemp())
+        self.small = [
+            patch.object(writer, "SEGMENT_BYTES", 100), patch.object(log_collection, "PART", 23),
+            patch.object(log_collection, "TURN", 70), patch.object(log_collection, "_OVERLAP", 8),
+        ]  # fmt: skip
+        for one in self.small:
+            one.start()
+        self.rig = Rig(self.folder)
+        self.written = b""
+        self.next = 0
+
+    @rule(lines=st.integers(1, 20), ends=st.booleans())
+    def write(self, lines, ends):
+        """Each line differs, so that a byte in another place is found."""
+        content = b"".join(b"line %d\n" % (self.next + at) for at in range(lines))
+        self.next += lines
+        content = content if ends else content[:-3]
+        self.rig.alpha.write(content)
+        self.written += content
+
+    @rule()
+    def rotate(self):
+        self.rig.alpha.rotate()
+
+    @rule(looks=st.integers(1, 3))
+    def collect(self, looks):
+        self.rig.collect(looks)
+
+    @rule()
+    def start_again(self):
+        self.rig.start()
+
+    @rule()
+    def host_returns(self):
+        """The host was away, and the collector missed nothing that it can still get."""
+        self.rig.master.hosts = [host(HOST, "lost")]
+        self.rig.collect()
+        self.rig.master.hosts = [host(HOST)]
+
+    @rule(
+        at=st.sampled_from(["_append", "_add_marks", "_compress", "_remove"]),
+        calls=st.integers(0, 3), part=st.integers(0, 30),
+    )  # fmt: skip
+    def crash(self, at, calls, part):
+        """Kill the collector before a step, or in the middle of writing; start the next one."""
+        there, left = getattr(writer, at), iter(range(calls))
+
+        def crash(*given):
+            if next(left, None) is None:
+                if at == "_append":
+                    there(given[0], given[1][:part])
+                raise Crash
+            there(*given)
+
+        with patch.object(writer, at, crash), contextlib.suppress(Crash):
+            self.rig.collect(2)
+        self.rig.start()
+
+    @invariant()
+    def what_is_stored_was_written(self):
+        if not hasattr(self, "rig") or not self.rig.files():
+            return
+        stored = self.rig.chunks(most=50)
+        assert stored in ([], [(0, self.written[: len(stored[0][1]) if stored else 0])])
+
+    def teardown(self):
+        try:
+            if self.written:
+                self.rig.collect(len(self.written) // 70 + 2)
+                assert self.rig.chunks(most=50) == [(0, self.written)]
+        finally:
+            for one in self.small:
+                one.stop()
+            shutil.rmtree(self.folder)
+
+
+TestShipping = Shipping.TestCase
+TestShipping.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
+
+
+@pytest.fixture
+def rig(tmp_path, monkeypatch):
+    return Rig(tmp_path)
+
+
+def test_dropped_output_is_a_gap_at_its_offset(rig):
+    """The host's own bound removed output before the collector came."""
+    rig.alpha.write(b"x" * 50 + b"\n")
+    rig.collect()
+    rig.alpha.write(b"y" * 50 + b"\n")
+    rig.alpha.rotate(keep=0)
+    rig.alpha.write(b"new\n")
+    rig.collect()
+    assert rig.chunks() == [(0, b"x" * 50 + b"\n"), (102, b"new\n")]
+
+
+def test_each_start_and_time_is_stored_with_the_output(rig):
+    rig.alpha.write(b"one\n", at=1_700_000_000.0)
+    rig.alpha.write(b"two\n", at=1_700_000_009.0)
+    rig.collect()
+    assert list(rig_part(rig).marks[:3]) == [
+        (1_700_000_000.0, 0, 77), (1_700_000_000.0, 4, 0), (1_700_000_009.0, 8, 0),
+    ]  # fmt: skip
+
+
+def rig_part(rig):
+    return LogArchive(rig.directory).read_log(HOST, PROCESS, 1, 0)
+
+
+def test_an_ended_log_is_compressed_and_not_asked_for_again(rig):
+    rig.alpha.write(b"done\n" * 100)
+    rig.alpha.ended.add((PROCESS, 1))
+    rig.master.processes = [process(PROCESS, "finished", host=HOST)]
+    rig.collect()
+    assert rig.files() == ["nav.1.0.0-500.log.gz", "nav.1.0.0-500.times.gz"]
+    asked = len(rig.master.asked)
+    rig.collect(3)
+    assert len(rig.master.asked) == asked
+
+
+def test_former_hosts_are_found_by_their_events(rig):
+    """The process has moved before the collector was started."""
+    rig.master.processes = [process(PROCESS, host="beta", number=2)]
+    rig.master.note(kind="migrated", host="beta")
+    rig.master.events[-1] = replace(rig.master.events[-1], facts={"from": HOST})
+    rig.alpha.write(b"before\n")
+    rig.collect()
+    assert rig.chunks() == [(0, b"before\n")]
+
+
+def test_another_log_of_the_same_number_is_another_generation(rig):
+    """The state directory of the host was removed; the new log may be shorter or longer."""
+    rig.alpha.write(b"former %d\n" % 7 * 3)
+    rig.collect()
+    for content in (b"second\n", b"third, and longer than the second\n" * 3):
+        rig.alpha.remove_logs()
+        rig.alpha.write(content)
+        rig.start()
+        rig.collect()
+    former = b"former 7\n" * 3
+    assert rig.chunks() == [(0, former + b"second\n" + b"third, and longer than the second\n" * 3)]
+    rig.start()
+    rig.collect()
+    assert [name.split(".")[2] for name in rig.files() if name.endswith((".log", ".gz"))] == [
+        "0", "0", "1", "1", "2",
+    ]  # fmt: skip
+
+
+def test_a_host_that_has_lost_its_newest_bytes_doubles_nothing(rig):
+    """A power failure on the host; the archive already has those bytes."""
+    rig.alpha.write(b"one\ntwo\nthree\n")
+    rig.collect()
+    os.truncate(rig.alpha.path(), 8)
+    rig.alpha.ended.add((PROCESS, 1))
+    rig.start()
+    rig.collect()
+    assert rig.chunks() == [(0, b"one\ntwo\nthree\n")]
+
+
+def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig):
+    rig.alpha.write(b"one\n")
+    rig.master.silent.add(HOST)
+    rig.collect(3)
+    assert rig.said == ["the slave of alpha does not answer"]
+    rig.master.silent.clear()
+    rig.collect()
+    assert rig.chunks() == [(0, b"one\n")]
+
+
+def test_a_full_disk_loses_and_doubles_nothing(rig, monkeypatch):
+    """A part of the bytes was written before the disk was full."""
+    rig.alpha.write(b"one\ntwo\n")
+    real = os.write
+
+    def full(file, content):
+        if len(content) < 8:
+            raise OSError(28, "No space left on device")
+        return real(file, content[:3])
+
+    monkeypatch.setattr(os, "write", full)
+    with pytest.raises(OSError, match="No space left"):
+        rig.collect()
+    monkeypatch.setattr(os, "write", real)
+    rig.collect()
+    assert rig.chunks() == [(0, b"one\ntwo\n")]
+
+
+def test_a_quiet_log_is_asked_for_less_and_less_often(rig, monkeypatch):
+    """An event about the process ends the wait."""
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    rig.collector._every = 2.0
+    rig.alpha.write(b"one\n")
+    rig.collect()
+    waits = []
+    for _ in range(6):
+        log = rig.collector._logs[HOST, PROCESS]
+        waits.append(log.due - now[0])
+        now[0] = log.due
+        rig.collect()
+    assert waits == [2.0, 4.0, 8.0, 16.0, 30.0, 30.0]
+    rig.alpha.write(b"two\n")
+    rig.master.note(kind="backoff", host=HOST)
+    rig.collect()
+    assert rig.chunks() == [(0, b"one\ntwo\n")]
+
+
+# --- bounds -----------------------------------------------------------------------------------
+
+
+def test_the_oldest_output_is_removed_first_and_never_collected_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer, "SEGMENT_BYTES", 1000)
+    rig = Rig(tmp_path, ArchiveLimits(5 * 8192, 1 << 40))
+    for number in range(1, 9):
+        rig.alpha.write(b"%d" % number * 999 + b"\n", number)
+        rig.alpha.ended.add((PROCESS, number))
+        rig.master.processes = [process(PROCESS, "finished", host=HOST, number=number)]
+        rig.master.note(host=HOST)
+        rig.collect()
+        for path in rig.directory.glob(f"hosts/alpha/nav.{number}.*"):
+            os.utime(path, (number, number))
+    rig.start()
+    rig.collect(2)
+    kept = [number for number in range(1, 9) if rig.chunks(number)]
+    assert kept == [4, 5, 6, 7, 8]
+    assert sum(path.stat().st_size for path in rig.directory.glob("hosts/alpha/nav.1.*")) == 0
+
+
+def test_open_logs_are_closed_where_they_alone_exceed_a_bound(tmp_path):
+    """Many running processes may each have a log that is not closed yet."""
+    rig = Rig(tmp_path, ArchiveLimits(1 << 40, 3 * 8192))
+    rig.writer._limits = ArchiveLimits(20_000, 20_000)
+    rig.alpha.write(b"x" * 100_000)
+    rig.collect()
+    assert [name for name in rig.files() if name.endswith(".log.gz")] == ["nav.1.0.0-100000.log.gz"]
+
+
+# --- hostile hosts ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["../../evil", "..", ".hidden", "a/b", "-", "\0", "collector.lock"]
+)
+def test_no_name_leads_out_of_the_archive(tmp_path, name):
+    rig = Rig(tmp_path)
+    rig.master.slaves = {name: rig.alpha}
+    rig.master.hosts = [host(name)]
+    rig.master.processes = [process("../" + PROCESS, host=name)]
+    rig.alpha.write(b"one\n", name="../" + PROCESS)
+    rig.collect()
+    (log,) = rig.directory.glob("hosts/*/*.log")
+    assert log.read_bytes() == b"one\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"alpha", "archive"}
+
+
+PARTS = [
+    {"number": 2}, {"next_offset": 99}, {"content": b"x" * (1 << 20), "next_offset": 1 << 20},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", PARTS)
+def test_an_impossible_part_is_refused(rig, wrong):
+    """The other logs are collected nevertheless."""
+    good = LogPart(1, (1,), b"one\n", 0, 4, False, ())
+    rig.master.read_log = lambda host, process, number, *_: (
+        replace(good, **wrong) if number else good
+    )
+    rig.collect()
+    (said,) = rig.said
+    assert said.endswith("alpha sent an impossible part of the log of nav#1")
+    assert rig.files() == []
+
+
+def test_impossible_times_are_left_out(rig):
+    marks = [
+        (math.nan, 1, 0), (math.inf, 2, 0), (-5.0, 2, 0), (1e300, 2, 0), (7.0, 3, 0), (8.0, 1, 9),
+        (9.0, 1 << 63, 5),
+    ]  # fmt: skip
+    part = LogPart(1, (1,), b"one\n", 0, 4, True, marks)
+    rig.master.read_log = lambda *_: part
+    rig.collect()
+    assert list(rig_part(rig).marks) == [(7.0, 3, 0), (9.0, 4, 0)]

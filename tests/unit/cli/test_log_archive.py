@@ -1,0 +1,112 @@
+"""`rosrm logs --archive`: output of hosts that are gone, from a log archive."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from rosrm.cli import connection
+from rosrm.errors import NoMaster
+from tests.unit.archive.rig import HOST, PROCESS, Rig
+from tests.unit.cli.conftest import host, process
+
+LINES = b"one\n[ERROR] [1.5] [nav]: battery\nthree\n"
+
+
+@pytest.fixture
+def rig(client, tmp_path):
+    """Provide a collected log of a host that is lost."""
+    rig = Rig(tmp_path)
+    rig.alpha.write(b"hours ago\n", at=time.time() - 7200)
+    rig.alpha.write(LINES)
+    rig.collect()
+    client.hosts = [host(HOST, "lost"), host("beta")]
+    client.processes = [process(PROCESS, "unreachable", host=HOST)]
+    client.events = []
+    client.read_log = rig.master.read_log
+    return rig
+
+
+def test_the_output_of_a_lost_host_is_read_from_the_archive(rosrm, rig):
+    """The command says so, and what the archive has."""
+    result = rosrm("logs", PROCESS, "--archive", str(rig.directory))
+    assert (result.code, result.out) == (0, "hours ago\n" + LINES.decode())
+    assert "nav: alpha is lost: the master received its last reading" in result.err
+    assert f"is read from {rig.directory}, as collected until 20" in result.err
+    assert rosrm("logs", PROCESS).code == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "output"),
+    [
+        (["--tail", "2"], "[ERROR] [1.5] [nav]: battery\nthree\n"),
+        (["--since", "1h"], LINES.decode()),
+        (["--grep", "batt"], "[ERROR] [1.5] [nav]: battery\n"),
+        (["--host", HOST, "--tail", "1"], "three\n"),
+    ],
+)
+def test_options_select_from_the_archive_too(rosrm, rig, options, output):
+    assert rosrm("logs", PROCESS, "--archive", str(rig.directory), *options).out == output
+
+
+def test_older_instances_come_from_the_archive_and_newer_ones_from_their_host(rosrm, client, rig):
+    """An instance whose log the slave has removed is only in the archive."""
+    client.hosts = [host(HOST)]
+    client.processes = [process(PROCESS, host=HOST, number=2)]
+    rig.alpha.remove_logs()
+    rig.alpha.write(b"now\n", 2)
+    out = rosrm("logs", PROCESS, "--archive", str(rig.directory)).out
+    lines = [line for line in out.splitlines() if "---" not in line]
+    assert lines == ["hours ago", *LINES.decode().splitlines(), "now"]
+
+
+def test_without_a_master_the_archive_is_read(rosrm, rig, monkeypatch):
+    def connect(*_):
+        raise NoMaster("no master answers in domain 7.")
+
+    monkeypatch.setattr(connection, "connect", connect)
+    result = rosrm("logs", PROCESS, "--archive", str(rig.directory), "--tail", "1")
+    assert (result.code, result.out) == (0, "three\n")
+    assert "no master answers in domain 7. Only collected logs are printed" in result.err
+    assert rosrm("logs", PROCESS).code == 3
+
+
+def test_a_process_that_master_and_archive_do_not_know_is_refused(rosrm, rig):
+    result = rosrm("logs", "nobody", "--archive", str(rig.directory))
+    assert (result.code, "no such process: 'nobody'" in result.err) == (1, True)
+
+
+def test_a_directory_that_is_no_archive_is_refused(rosrm, rig, tmp_path):
+    result = rosrm("logs", PROCESS, "--archive", str(tmp_path / "nowhere"))
+    assert (result.code, "is no log archive" in result.err) == (1, True)
+
+
+def test_a_damaged_file_is_named(rosrm, rig):
+    rig.alpha.ended.add((PROCESS, 1))
+    rig.start()
+    rig.collect()
+    (file,) = rig.directory.glob("hosts/alpha/*.log.gz")
+    file.write_bytes(file.read_bytes()[:-9])
+    result = rosrm("logs", PROCESS, "--archive", str(rig.directory))
+    assert (result.code, "its log in" in result.err) == (1, True)
+    assert "cannot be read" in result.err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--keep", "much"], "--keep: "), (["--keep-host", "1kB"], "--keep-host: "),
+        (["--every", "0s"], "--every: "), (["--max-rate", "-1"], "--max-rate: "),
+    ],
+)  # fmt: skip
+def test_a_wrong_option_of_the_collector_is_refused(rosrm, tmp_path, options, message):
+    result = rosrm("collect-logs", str(tmp_path / "archive"), *options)
+    assert (result.code, message in result.err) == (2, True)
+    assert not (tmp_path / "archive").exists()
+
+
+def test_a_directory_that_cannot_be_used_is_refused(rosrm, tmp_path):
+    (tmp_path / "file").touch()
+    result = rosrm("collect-logs", str(tmp_path / "file"))
+    assert (result.code, "cannot be used" in result.err) == (2, True)
