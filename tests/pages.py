@@ -88,6 +88,7 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/how-to/many-hosts-discovery.md": "a server at an address of its own network",
     "docs/how-to/adopt.md": "a node of a ROS installation; tests/ros/test_adoption.py adopts one",
     "docs/how-to/alerts.md": "a chat; tests/unit/tools/alerts/test_page.py checks its file",
+    "docs/how-to/collected-logs.md": "tests/ros/test_collected_logs.py runs a collector",
     "docs/how-to/reports.md": "its sources are long runs; tests/unit/cli/test_report.py has them",
     "docs/how-to/diagnostics.md": "`ros2` of a ROS installation",
     "docs/how-to/security.md": "a ROS 2 with DDS security, which the wheels lack",

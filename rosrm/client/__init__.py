@@ -3,7 +3,9 @@
 client.py       the client: requests, listings, events, logs, waiting
 connecting.py   finds the master, with the settings that commands use
 waiting.py      waits for states of processes and hosts
-logs.py         reads the logs of processes from the slaves that hold them
+logs.py         reads the logs of processes from the slaves that hold them, or from an archive
+log_collection.py  requests new output of all processes for an archive
+no_master.py    stands for the connection where only collected logs are read
 artifacts.py    sends the contents of artifacts before a submission
 retrying.py     repeats requests while the master does not answer
 """
