@@ -51,6 +51,7 @@ def checked_host(root: Node, path: str | Path, registry: Registry | None) -> Hos
     assert config is not None  # else there was a problem
     return replace(
         config, state=settled(config.state, path), probes=probes if given else None,
+        textfile=config.textfile if config.textfile == Path() else settled(config.textfile, path),
         strategies=strategies,
     )  # fmt: skip
 

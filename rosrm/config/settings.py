@@ -527,6 +527,7 @@ class HostConfig:
         artifacts: cache of the artifacts of processes.
         on_stop: "stop": a slave that is stopped stops its processes; "keep": it leaves them running
             under the supervisor.
+        textfile: directory in which the slave writes metrics of its host; empty: it writes none.
     """
 
     host: str = field(default_factory=socket.gethostname)
@@ -551,6 +552,7 @@ class HostConfig:
     artifacts: ArtifactCacheSettings = field(default_factory=ArtifactCacheSettings)
     on_stop: Literal["stop", "keep"] = "stop"
     devices: OfferedByKind = field(default_factory=lambda: EMPTY)
+    textfile: Path = Path()
 
     def __post_init__(self) -> None:
         """Set the default of `state`, which depends on the name, limits, and kinds of devices."""

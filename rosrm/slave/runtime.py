@@ -71,10 +71,11 @@ from rosrm.slave.launch.starter import Starter
 from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
 from rosrm.slave.replication.service import ReplicationService
-from rosrm.slave.sampler import ProbeReport, Sampler
+from rosrm.slave.sampler import ProbeReport, Sample, Sampler
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.shutdown import STOP_ALL, Shutdown
 from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.slave.textfile import HostMetrics, Textfile
 from rosrm.slave.usage import UsageWatch
 from rosrm.version import __version__
 from rosrm.wording import by_reason, counted, reload_summary
@@ -156,6 +157,8 @@ class SlaveRuntime:
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._settings_check.hang_up)
             opened.callback(self._settings_check.close)
+            self._textfile = Textfile(config.textfile, config.host)
+            opened.callback(self._textfile.remove)
             self._open_supervisor(opened)
             graph = self._join_ros(opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
@@ -434,7 +437,21 @@ class SlaveRuntime:
             processes=self._state.live(),
         )  # fmt: skip
         self._publish_usage()
+        if self._textfile.is_due(now):
+            self._write_textfile(sample, now)
         self._take(TimePassed())
+
+    def _write_textfile(self, sample: Sample, now: float) -> None:
+        """Write metrics of this host for a node exporter."""
+        listed = list(enumerate(one.name for one in self._sampler.resources))
+        fresh = [(slot, name) for slot, name in listed if not sample.stale >> slot & 1]
+        metrics = HostMetrics(
+            is_registered=self._is_registered, is_accepting=self._accepting,
+            usage={name: float(sample.usage[slot]) for slot, name in fresh},
+            limits={name: float(self._limit[slot]) for slot, name in listed},
+            instances=self._state.statuses(),
+        )  # fmt: skip
+        self._textfile.write(metrics, now)
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
         """Log which readings became stale or fresh again, and report that to the master."""

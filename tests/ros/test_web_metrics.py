@@ -16,8 +16,14 @@ from tests.waiting import PATIENCE, wait_until
 
 
 @pytest.fixture(scope="module")
-def cluster(make_shared):
-    made = make_shared(host("robot-1"))
+def collected(tmp_path_factory):
+    """Return the directory of a node exporter's textfile collector."""
+    return tmp_path_factory.mktemp("collector")
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared, collected):
+    made = make_shared(host("robot-1", textfile=collected))
     made.submit(service("talker"))
     made.wait("talker", "running")
     return made
@@ -71,6 +77,21 @@ def test_the_command_prints_metrics_or_replaces_a_file(cluster, tmp_path):
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 130
     assert [one.name for one in tmp_path.iterdir()] == ["rosrm.prom"]
+
+
+def test_a_slave_writes_the_metrics_of_its_host(cluster, collected):
+    """Beside those of the master, for a node exporter on that host."""
+    file = collected / "rosrm_slave_robot-1.prom"
+    expected = {
+        'rosrm_slave_registered{host="robot-1"} 1',
+        'rosrm_slave_instances{host="robot-1",state="ready"} 1',
+    }
+    wait_until(
+        lambda: file.exists() and expected <= set(file.read_text().splitlines()),
+        "the file shows the registered host and its process",
+        seen=lambda: file.exists() and file.read_text(),
+    )  # fmt: skip
+    assert 'rosrm_slave_usage_ratio{host="robot-1",resource="memory"} ' in file.read_text()
 
 
 @pytest.mark.parametrize(

@@ -61,10 +61,12 @@ def test_every_setting_is_read(file, tmp_path, registry):
             logs: {max_bytes: 1MB, keep: 1}
             control: {max_age: 8s}
             on_stop: keep
+            textfile: metrics
             """
         ),
         registry,
     )
+    assert config.textfile == tmp_path / "metrics"
     assert (config.host, config.ros.domain, config.state) == ("robot-1", 3, tmp_path / "here")
     assert config.labels == {"camera": "front", "gpu": "true", "floor": "2"}
     assert (config.scope, config.budget["memory"]) == ("slice", 2.0**31)
