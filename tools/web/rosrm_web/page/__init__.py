@@ -7,4 +7,9 @@ site       the page and its tabs
 views      the grid of all tables, and the columns of hosts and events
 processes  the tree of processes, with its search
 dialogs    explanation, logs, and confirmation of an action
+
+timeline       PURE: picture of processes over hosts, from the events and a listing
+timeline_feed  the events, for all browsers
+timeline_chart the picture as options of ECharts
+timeline_view  the picture with its controls, and the same as a table
 """

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from fastapi import Depends
 from nicegui import Client, ui
 from nicegui import app as nicegui_app
 
 from rosrm_web.master_link import Busy
-from rosrm_web.page import dialogs, rows, views
+from rosrm_web.page import dialogs, rows, timeline_view, views
 from rosrm_web.page.live import Live
 from rosrm_web.page.processes import Processes
+from rosrm_web.page.timeline_feed import Feed
 from rosrm_web.page.tree import Choice
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
+    from nicegui.events import ValueChangeEventArguments
 
     from rosrm_web.gateway import Gateway
 
@@ -46,11 +48,11 @@ _STYLE: Final = """
 
 def mount(app: FastAPI, gateway: Gateway) -> None:
     """Add the page to the application of the gateway, at `/`."""
-    live = Live(gateway)
+    live, feed = Live(gateway), Feed(gateway)
     nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
     room = [Depends(partial(_check_room, live))]
     page = ui.page("/", title="rosrm", dark=None, reconnect_timeout=_ABSENCE, dependencies=room)
-    page(partial(_page, gateway, live))
+    page(partial(_page, gateway, live, feed))
     ui.run_with(app, show_welcome_message=False, language="en-US", reconnect_timeout=_PINGS)
 
 
@@ -62,10 +64,10 @@ async def _check_room(live: Live) -> None:
         raise Busy(f"{MOST_PAGES} pages are open already; close one, or try again later")
 
 
-def _page(gateway: Gateway, live: Live) -> None:
+def _page(gateway: Gateway, live: Live, feed: Feed) -> None:
     client = ui.context.client
     request = client.request
-    page = Page(gateway, live, may_act=bool(request.scope["may_act"]))
+    page = Page(gateway, live, feed, may_act=bool(request.scope["may_act"]))
     client.on_delete(page.leave)
     live.join(page.update)
     page.update()
@@ -77,19 +79,20 @@ class Page:
     Args:
         gateway: sends the requests.
         live: has the newest listing.
+        feed: has the events of the timeline.
         may_act: the user is an operator, and the gateway acts.
     """
 
-    def __init__(self, gateway: Gateway, live: Live, *, may_act: bool) -> None:
+    def __init__(self, gateway: Gateway, live: Live, feed: Feed, *, may_act: bool) -> None:
         self._gateway, self._live = gateway, live
-        ui.add_css(_STYLE)
+        ui.add_css(_STYLE + timeline_view.STYLE)
         ui.colors(primary="#1b4f8a", negative="#b00020")
         self._header(may_act=may_act)
         of_process, of_host = (dialogs.OF_PROCESS, dialogs.OF_HOST) if may_act else ((), ())
         self._process = dialogs.ProcessDialog(gateway, of_process, live.wake)
         self._host = dialogs.Dialog(gateway, of_host, live.wake)
         with ui.tabs() as self._tabs:
-            for name in ("hosts", "processes", "events"):
+            for name in ("hosts", "processes", "timeline", "events"):
                 ui.tab(name, name.capitalize()).props("no-caps")
         panels = ui.tab_panels(self._tabs, value="hosts", keep_alive=True, animated=False)
         with panels.classes("w-full"):
@@ -98,6 +101,9 @@ class Page:
                 self._hosts = views.Table(views.HOSTS, "Hosts", on_host)
             with ui.tab_panel("processes").classes("p-0"):
                 self._processes = Processes(self._process.open)
+            with ui.tab_panel("timeline").classes("p-0"):
+                self._timeline = timeline_view.Timeline(feed, live, self._process.open)
+                self._tabs.on_value_change(self._show_timeline)
             with ui.tab_panel("events").classes("p-0"):
                 self._events = views.Table(views.EVENTS, "Events")
         self._problems: list[rows.Problem] = []
@@ -120,9 +126,13 @@ class Page:
         self._hosts.show(rows.host_rows(listing.hosts))
         self._processes.show(listing.processes)
         self._events.show(rows.event_rows(self._live.events, _SHOWN_EVENTS))
+        self._timeline.update()
         found = rows.problems(listing)
         if found != self._problems:
             self._show_problems(found)
+
+    def _show_timeline(self, tab: ValueChangeEventArguments[Any]) -> None:
+        self._timeline.show(is_shown=tab.value == "timeline")
 
     def _show_problems(self, found: list[rows.Problem]) -> None:
         self._problems = found

@@ -1,0 +1,149 @@
+"""The timeline of the page in a real browser, against a real cluster."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+
+from rosrm.model.values import MigrationPolicy
+from tests.ros.browser_kit import browser, tab
+from tests.ros.clusters import STEADY, Cluster, host, job, service
+from tests.ros.web_kit import Gateway, gateway
+
+MOVES = MigrationPolicy("relaunch")
+#: HTML in the reason of a failure and of a move: the name of a program that does not exist.
+HTML = "<img src=x onerror=alert(1)>"
+#: A shape that only arrows have: the line between two lanes.
+ARROW = 'path[stroke-width="1.5"]'
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with browser() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def cluster(make_shared) -> Cluster:
+    """Return a cluster with a process that stays, and one that failed."""
+    made = make_shared(host("robot-1"), host("robot-2"), liveness=STEADY)
+    made.submit(service("stays"), job("loser", "sh", "-c", "exit 4"))
+    made.wait("stays", "running")
+    made.ended("loser")
+    return made
+
+
+@pytest.fixture(scope="module")
+def web(cluster):
+    with gateway(cluster.ros) as one:
+        yield one
+
+
+@pytest.fixture
+def page(chromium, web: Gateway):
+    with tab(chromium, web.url) as one:
+        open_timeline(one)
+        yield one
+
+
+def open_timeline(page: Any) -> None:
+    page.get_by_role("tab", name="Timeline").click()
+    text(page, "robot-2").wait_for()
+
+
+def narrow(page: Any, process: str) -> None:
+    page.get_by_role("textbox", name="Process").fill(process)
+
+
+def text(page: Any, content: str) -> Any:
+    """Return a text of the picture."""
+    return page.locator("svg text", has_text=content).first
+
+
+def mark(page: Any, content: str) -> Any:
+    """Return a row of the table of moves and faults."""
+    return page.locator(".rosrm-marks .ag-row", has_text=content).first
+
+
+def test_a_move_appears_live_with_its_arrow(page, cluster):
+    """In the picture, in the table, and in the summary; none of them needs a reload."""
+    page.get_by_role("button", name="1 min").click()
+    narrow(page, "mover")
+    page.get_by_text("no processes, no moves").wait_for()
+    cluster.submit(service("mover", migration=MOVES))
+    source = cluster.wait("mover", "running").host
+    text(page, "mover").wait_for()
+    assert page.locator(ARROW).count() == 0
+
+    cluster.client.migrate("mover")
+    page.locator(ARROW).wait_for(state="attached")  # a vertical line has no area
+    assert f"{source} to robot-" in mark(page, "moved").inner_text()
+    page.get_by_text("1 move,").wait_for()
+
+
+def test_a_bar_opens_its_process(page):
+    """A click on the bar leads to the explanation."""
+    page.get_by_role("button", name="1 min").click()
+    text(page, "stays").click()
+    page.get_by_role("dialog").get_by_role("heading", name="stays").wait_for()
+
+
+def test_earlier_looks_back_and_now_follows_again(page):
+    """What began later is not shown in the look back."""
+    text(page, "stays").wait_for()
+    page.get_by_role("button", name="Earlier").click()
+    page.get_by_text("looking back").wait_for()
+    page.get_by_role("button", name="Earlier").click()
+    text(page, "stays").wait_for(state="detached")
+
+    page.get_by_role("button", name="Now").click()
+    page.get_by_text("live", exact=True).wait_for()
+    text(page, "stays").wait_for()
+
+
+def test_the_wheel_zooms_and_the_picture_stops(page):
+    """Otherwise the part that the user looks at would move away."""
+    page.get_by_text("live", exact=True).wait_for()
+    area = page.locator(".rosrm-timeline").bounding_box()
+    page.mouse.move(area["x"] + area["width"] / 4, area["y"] + area["height"] / 3)
+    page.mouse.wheel(0, -200)
+    page.get_by_text("looking back").wait_for()
+
+
+def test_a_name_narrows_the_picture(page):
+    """The lane of a host without such processes goes away."""
+    narrow(page, "no such process")
+    text(page, "robot-1").wait_for(state="detached")
+    narrow(page, "")
+    text(page, "robot-1").wait_for()
+
+
+def test_html_in_a_reason_stays_text(page, cluster):
+    """Only the unit test of the options looks at the text beside the pointer."""
+    narrow(page, "no-program")
+    cluster.submit(job("no-program", HTML))  # each host is tried
+    mark(page, HTML).wait_for()
+    assert page.locator("img").count() == 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_serious_finding_of_an_accessibility_checker(chromium, web, scheme):
+    """Names, roles and contrasts of the timeline, by axe-core."""
+    with tab(chromium, web.url, color_scheme=scheme) as page:
+        open_timeline(page)
+        mark(page, "loser").wait_for()
+        found = Axe().run(page).response["violations"]
+
+    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    assert [(one["id"], one["nodes"][0]["html"][:200]) for one in serious] == []
+
+
+def test_the_timeline_fits_a_phone(chromium, web):
+    """Only the table scrolls sideways."""
+    with tab(chromium, web.url, viewport={"width": 390, "height": 844}) as page:
+        open_timeline(page)
+        wide = page.evaluate("document.documentElement.scrollWidth")
+
+    assert wide <= 390

@@ -1,0 +1,77 @@
+"""The events of the timeline: read once, then followed."""
+
+from __future__ import annotations
+
+import asyncio
+
+from rosrm.model.rows import EventRow, Listing
+from rosrm_web.gateway import Gateway
+from rosrm_web.page.timeline_feed import Feed
+from rosrm_web.watching import MOST_EVENTS
+from tests.unit.tools.report.runs import events
+
+
+class Master:
+    """A client of a master with these events."""
+
+    def __init__(self) -> None:
+        self.rows = events(
+            (0, "assigned", "p", "a", "", {"number": 1, "decision": {}}), (1, "running", "p", "a")
+        )
+        self.reads = 0
+
+    def list(self, *, events: bool = False, after: int = 0, **_) -> Listing:
+        self.reads += events
+        return Listing("m", 1.0, 2, events=[one for one in self.rows if one.sequence > after])
+
+    def master_load(self):
+        """Return nothing: no load was published."""
+
+    def close(self):
+        """Leave nothing."""
+
+
+def placements(feed: Feed) -> list[str]:
+    return [one.process for one in feed.timeline.processes.histories(9.0).placements]
+
+
+def row(sequence: int, process: str) -> EventRow:
+    return EventRow(sequence, 1.7e9, float(sequence), "assigned", process, "a", "")
+
+
+def test_the_events_are_read_once_and_then_followed():
+    """All browsers share them; an event that is known already counts once."""
+
+    async def scene() -> None:
+        master = Master()
+        gateway = Gateway(lambda _: master)
+        await gateway.watcher.look()
+        feed = Feed(gateway)
+        feed.take([row(2, "early")])
+        await asyncio.gather(feed.read(), feed.read())
+        assert (placements(feed), feed.newest, master.reads) == (["p"], 2, 1)
+
+        feed.take([row(2, "again"), row(3, "q")])
+        assert (placements(feed), feed.newest) == (["p", "q"], 3)
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_a_burst_that_may_have_a_gap_is_read_again():
+    """The watcher leaves out the oldest events of a large burst."""
+
+    async def scene() -> None:
+        master = Master()
+        gateway = Gateway(lambda _: master)
+        await gateway.watcher.look()
+        feed = Feed(gateway)
+        await feed.read()
+        feed.take([row(10 + number, "late") for number in range(MOST_EVENTS)])
+        assert placements(feed) == ["p"]
+        master.rows.append(row(3000, "q"))
+        await feed.read()
+        assert (placements(feed), feed.newest, master.reads) == (["p", "q"], 3000, 2)
+        gateway.close()
+
+    asyncio.run(scene())
