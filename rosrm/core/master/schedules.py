@@ -37,7 +37,7 @@ def change_between_runs(
     state.set_spec(process, spec)
     if not schedule:
         process.next_run = 0.0
-        state.enqueue(process, now)
+        queue_again(state, process, now)
     elif former.every and schedule.every:  # counted from its last start
         process.next_run += schedule.every - former.every
     elif former != schedule:

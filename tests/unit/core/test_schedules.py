@@ -225,3 +225,16 @@ def test_a_job_that_loses_its_schedule_between_two_runs_runs_once() -> None:
     cluster.finish("p")
     cluster.wait(15.0)
     assert (cluster.phase("p"), starts(cluster)) == ("finished", 2)
+
+
+def test_a_job_that_loses_its_schedule_is_queued_like_a_new_one() -> None:
+    """Its place is after all that wait, and a host on which its last run failed is allowed."""
+    cluster = Cluster("a")
+    fields = {"restart": RestartPolicy("never"), "reschedule": ReschedulePolicy(1)}
+    cluster.apply("app", job("p", schedule=EVERY_10_S, **fields))
+    cluster.submit(job("q"))
+    cluster.finish("p", code=2)
+    assert cluster["p"].failed_on
+    cluster.apply("app", job("p", **fields))
+    assert not cluster["p"].failed_on
+    assert cluster["p"].order > cluster["q"].order
