@@ -182,6 +182,20 @@ def test_an_order_has_no_limits_where_only_the_restart_policy_changes() -> None:
     assert cluster.orders(AmendInstance)[-1].amendment.limits == Limits(memory=1e9)
 
 
+def test_an_order_is_repeated_without_limits_after_a_restart_of_the_master() -> None:
+    """The journal has which parts of the running instance are still to be changed."""
+    cluster = Cluster("a")
+    spec = process("p", limits=Limits(memory=2e9))
+    cluster.apply("nav", spec)
+    cluster.cut("a")
+    cluster.apply("nav", replace(spec, restart=RestartPolicy("always")))
+    cluster.kill_master()
+    cluster.rejoin("a", 3.0)
+    assert not cluster.state.unamended
+    sent = {order.amendment for order in cluster.orders(AmendInstance)}
+    assert sent == {Amendment(RestartPolicy("always"), limits=None)}
+
+
 def test_refused_limits_stay_open_when_the_paused_version_is_applied_again() -> None:
     """The application is not as desired until the slave has changed the process."""
     cluster = Cluster(Machine("a", uses=1e9))

@@ -101,7 +101,8 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     next_spec = item.get("next_spec")  # absent in older journals
     process.next_spec = None if next_spec is None else from_plain(ProcessSpec, next_spec)
     if not item.get("amended", True):
-        state.unamended[process.name] = PendingAmendment()
+        limits = not item.get("limits_amended", False)  # absent in older journals
+        state.unamended[process.name] = PendingAmendment(limits)
     process.set_start(process.began, state.wall, now)
     if not process.is_at_rest:
         process.exit_code, process.ended_on = None, ""

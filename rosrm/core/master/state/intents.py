@@ -70,7 +70,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
     instances = [(str(number), tables.instances[number]) for number in process.instances]
     owner, left = tables.instances.get(process.owner), process.left_behind
     phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
-    standby = tables.standbys.get(process.name)
+    standby, pending = tables.standbys.get(process.name), tables.unamended.get(process.name)
     return Intent(
         "process", process.name,
         {
@@ -86,7 +86,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
             **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
             "excluded": dict(process.excluded),
             "failed_on": process.failed_on and to_plain(process.failed_on),
-            "amended": process.name not in tables.unamended,
+            "amended": pending is None, "limits_amended": pending is None or not pending.limits,
         },
     )  # fmt: skip
 
