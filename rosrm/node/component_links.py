@@ -112,9 +112,13 @@ class ComponentLinks:
                 os.kill(os.getpid(), signal.SIGKILL)
 
     def _destroy(self, node: Node) -> None:
+        """Destroy a node; its error must not end the executor, which serves the other nodes."""
         self.nodes.remove(node)
         self._executor.remove_node(node)
-        node.destroy_node()
+        try:
+            node.destroy_node()
+        except Exception as error:  # noqa: BLE001 - the component may raise anything
+            self._log.error(f"cannot destroy a component: {type(error).__name__}: {error}")
 
     def _run(self, work: Callable[[], None]) -> str:
         """Run a function in the executor; return the error that it raised, "": none."""

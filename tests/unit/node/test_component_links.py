@@ -6,10 +6,12 @@ import os
 import resource
 import socket
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 from rosrm.component import link
 from rosrm.node.component_links import ComponentLinks
+from tests.waiting import wait_until
 
 
 def connected(name: str) -> socket.socket:
@@ -55,3 +57,19 @@ def test_a_container_without_a_free_descriptor_takes_links_again_later(tmp_path)
         finally:
             resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     assert is_closed_by_container(connected(name))
+
+
+def test_a_component_that_cannot_be_destroyed_does_not_end_its_container(tmp_path):
+    """Its error is logged; it would otherwise leave the executor, which serves the other nodes."""
+    name, errors = str(tmp_path), []
+    node = SimpleNamespace(destroy_node=lambda: 1 / 0)
+    with ThreadPoolExecutor() as threads:
+        executor = SimpleNamespace(
+            create_task=threads.submit, add_node=lambda _: None, remove_node=lambda _: None
+        )
+        ComponentLinks(name, executor, lambda *_: node, SimpleNamespace(error=errors.append))
+        with connected(name) as connection:
+            link.send(connection, {"environment": {}, "plugin": "m:Node", "arguments": []})
+            assert link.receive(connection) == {"pid": os.getpid(), "fault": ""}
+        wait_until(lambda: errors, "the error of the component is logged")
+    assert errors == ["cannot destroy a component: ZeroDivisionError: division by zero"]
