@@ -559,7 +559,7 @@ class SlaveRuntime:
     def _filled(self, container: InstanceId, component: Component) -> Component:
         """Return a component with the values of its placeholders; raises `LaunchError`."""
         return filled_component(
-            component, self._state.held[container], devices=self._devices.devices,
+            component, self._state.held.get(container), devices=self._devices.devices,
             artifacts=self._artifacts.root, prefixes=self._prefixes,
         )  # fmt: skip
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rosrm.core.slave.state import HeldInstance
+from rosrm.errors import LaunchError
 from rosrm.model.devices import Device
 from rosrm.model.values import Assignment, Component, ProcessSpec
 from rosrm.slave.launch.artifacts import with_artifacts
@@ -14,7 +15,7 @@ from rosrm.slave.launch.packages import with_packages
 
 
 def filled_component(
-    component: Component, container: HeldInstance, *, devices: tuple[Device, ...],
+    component: Component, container: HeldInstance | None, *, devices: tuple[Device, ...],
     artifacts: Path, prefixes: Sequence[Path],
 ) -> Component:  # fmt: skip
     """Return a component with the values of its placeholders.
@@ -23,13 +24,16 @@ def filled_component(
 
     Args:
         container: instance into which the component is loaded; it holds devices and artifacts.
+            None: it has ended since.
         devices: devices of this host.
         artifacts: directory of the artifacts of all processes.
         prefixes: prefixes of the ament index on this host.
 
     Raises:
-        LaunchError: a device or a ROS package is not there.
+        LaunchError: the container, a device or a ROS package is not there.
     """
+    if container is None:
+        raise LaunchError("its container has ended")
     instance = container.status.instance
     spec = ProcessSpec(instance.process, components=(component,), artifacts=container.artifacts)
     assignment = Assignment(instance, spec, epoch=0, node_name="", devices=container.devices)

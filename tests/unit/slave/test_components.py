@@ -168,3 +168,9 @@ def test_a_component_gets_the_devices_and_artifacts_of_its_container() -> None:
     )  # fmt: skip
     with pytest.raises(LaunchError, match="camera front is no device of this host now"):
         filled()
+
+
+def test_a_component_whose_container_has_ended_is_not_loaded(tmp_path) -> None:
+    """The order to load may be older than the end of the container; the error says so."""
+    with pytest.raises(LaunchError, match="its container has ended"):
+        filled_component(CAMERA, None, devices=(), artifacts=tmp_path, prefixes=())
