@@ -84,8 +84,10 @@ def test_a_switch_keeps_the_pids_of_what_both_modes_share(make_cluster) -> None:
     assert cluster.wait("charger", "running").pid
     assert cluster.wait("mapper", "cancelled")
     assert {name: cluster.process(name).pid for name in pids} == pids
-    (row,) = cluster.client.list(hosts=True).hosts
-    assert {one.name: one.limit for one in row.resources}["memory"] == 0.5
+    cluster.wait_until(  # the restarted master has no limit before the first reading
+        "the memory limit of the mode",
+        lambda view: {one.name: one.limit for one in view.hosts[0].resources}["memory"] == 0.5,
+    )
 
 
 def test_a_mode_that_is_loaded_with_other_contents_is_other_work(make_cluster) -> None:

@@ -45,7 +45,11 @@ class Cluster:
         return self.lab.exec("desk", [ROSRM, *words], timeout=PATIENCE).stdout
 
     def hosts(self) -> dict[str, dict]:
-        done = self.lab.exec("desk", [ROSRM, "hosts", "--json"], check=False)
+        """Return the rows by host; {} while no master answers, or while the machine is too busy."""
+        try:
+            done = self.lab.exec("desk", [ROSRM, "hosts", "--json"], check=False)
+        except subprocess.TimeoutExpired:  # the waits have limits of their own
+            return {}
         if done.returncode == NO_MASTER_YET:
             return {}
         return {row["name"]: row for row in json.loads(done.stdout)}
