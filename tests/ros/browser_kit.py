@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,6 +13,8 @@ from tests.waiting import PATIENCE
 
 #: Seconds for one step of a page: on a busy machine a browser, a gateway and a cluster share a CPU.
 BROWSER_PATIENCE = 3 * PATIENCE
+#: Link of `tab` over a bad mobile network: milliseconds of delay, bytes per second.
+SLOW_LINK = {"latency": 400, "downloadThroughput": 250_000, "uploadThroughput": 60_000}
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
 
 
@@ -35,7 +37,9 @@ def browser() -> Iterator[Any]:
 
 
 @contextmanager
-def tab(browser: Any, url: str, **options: Any) -> Iterator[Any]:
+def tab(
+    browser: Any, url: str, link: Mapping[str, int] | None = None, **options: Any
+) -> Iterator[Any]:
     """Yield a tab with a page; fail if the page reports an error or asks another machine."""
     context = browser.new_context(**options)
     context.set_default_timeout(BROWSER_PATIENCE * 1000)
@@ -45,6 +49,9 @@ def tab(browser: Any, url: str, **options: Any) -> Iterator[Any]:
     page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
     page.on("pageerror", lambda error: errors.append(str(error)))
     page.on("request", lambda asked: outside.append(asked.url) if _is_outside(asked.url) else None)
+    if link is not None:
+        limits = {"offline": False, **link}
+        context.new_cdp_session(page).send("Network.emulateNetworkConditions", limits)
     try:
         page.goto(url)
         yield page

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from tests.ros.browser_kit import browser, open_tab, row, tab
+from tests.ros.browser_kit import SLOW_LINK, browser, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
@@ -115,6 +115,22 @@ def test_a_change_is_in_a_tab_that_opens_later(page, cluster):
     open_tab(page, "Processes")
     row(page, "vast").wait_for()
     cluster.cancel("vast")
+
+
+def test_a_slow_link_loses_nothing(chromium, cluster, web):
+    """The page loads, follows changes, and opens a process, only later."""
+    with tab(chromium, web.url, SLOW_LINK) as page:
+        timing = page.evaluate("performance.getEntriesByType('navigation')[0].toJSON()")
+        assert timing["responseStart"] - timing["requestStart"] >= SLOW_LINK["latency"] / 2
+        open_tab(page, "Processes")
+        cluster.submit(service("slow", "sleep", "1000"))
+        row(page, "slow").dblclick()
+        dialog = page.get_by_role("dialog")
+        dialog.get_by_role("cell", name="chosen").wait_for()
+        dialog.get_by_role("button", name="Close").click()
+        dialog.wait_for(state="detached")
+        cluster.cancel("slow")
+        row(page, "slow").filter(has_text="cancelled").wait_for()
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
