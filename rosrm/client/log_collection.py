@@ -32,6 +32,8 @@ _OVERLAP: Final = 64
 _EVENTS: Final = 10_000
 #: Newest instances of a process on one host that are collected; a slave keeps 5 by default.
 _MOST_INSTANCES: Final = 1000
+#: Seconds for which a host that did not answer is not asked; a request waits for 10 s.
+_SILENT: Final = 60.0
 _NEVER: Final = float("inf")
 
 
@@ -78,6 +80,7 @@ class LogCollector:
         self._up: frozenset[str] = frozenset()
         self._sequence = 0
         self._said: dict[str, str] = {}
+        self._silent: dict[str, float] = {}
 
     def look(self, master: MasterClient) -> None:
         """Store the new output of all logs that are due.
@@ -87,17 +90,17 @@ class LogCollector:
             OSError: the archive cannot be written. The next call continues where it stopped.
         """
         self._take(self._list(master))
-        silent: set[str] = set()
         for host, process in self._due():
             if self._stop.is_set():
                 break
-            if host in silent:
+            if self._silent.get(host, 0.0) > time.monotonic():
                 continue
             try:
                 self._collect(master, host, process)
             except NoMaster as error:
-                silent.add(host)
+                self._silent[host] = time.monotonic() + _SILENT
                 self._say(host, str(error))
+                self._take(self._list(master))  # raises if the master is the silent one
             except Refused as refusal:
                 self._settle(host, process, refusal)
             else:
@@ -121,6 +124,8 @@ class LogCollector:
             log.live = 0
             if at[0] in up - self._up:  # the host may have lost its logs
                 self._logs[at] = _Log()
+        for host in up - self._up:
+            self._silent.pop(host, None)
         self._up = up
         listed = {row.name for row in listing.processes}
         for row in listing.processes:
@@ -169,15 +174,16 @@ class LogCollector:
         if not log.numbers:
             found = master.read_log(host, process, 0, 0, 1)
             log.numbers = found.numbers or (found.number,)
-        numbers, stored = sorted(set(log.numbers))[-_MOST_INSTANCES:], 0
-        for number in numbers:
+        stored = 0
+        for number in _newest(log.numbers):
             if number not in log.complete or number == log.live:
                 stored += self._store_new(master, Source(host, process, number), log)
-        log.complete.intersection_update(numbers)
+        newest = _newest(log.numbers)
+        log.complete.intersection_update(newest)
         log.wait = (
             min(2 * log.wait, self._every * _QUIET) if log.wait and not stored else self._every
         )
-        is_complete = not log.live and log.complete.issuperset(log.numbers)
+        is_complete = not log.live and log.complete.issuperset(newest)
         wait = 0.0 if stored >= TURN else log.wait
         log.due = _NEVER if is_complete else time.monotonic() + wait
 
@@ -228,3 +234,7 @@ class LogCollector:
                 f"{host} sent an impossible part of the log of {process}#{number}", "invalid"
             )
         return part
+
+
+def _newest(numbers: Sequence[int]) -> Sequence[int]:
+    return sorted(set(numbers))[-_MOST_INSTANCES:]

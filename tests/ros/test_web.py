@@ -10,6 +10,10 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter
 
+from rosrm.archive.layout import Source
+from rosrm.archive.retention import ArchiveLimits
+from rosrm.archive.writer import ArchiveWriter
+from rosrm.model.rows import LogPart
 from rosrm_web.access import Access
 from rosrm_web.app import routes
 from rosrm_web.changes import MOST_READERS
@@ -68,6 +72,18 @@ def test_a_log_is_plain_data(web):
     assert answer.json["chunks"][-1]["text"] == "<b>hello</b>\n"
     assert answer.headers["content-type"] == "application/json"
     assert answer.headers["x-content-type-options"] == "nosniff"
+
+
+def test_collected_output_is_shown_where_its_host_is_gone(cluster, tmp_path):
+    """The notes say where it is from."""
+    part = LogPart(1, (1,), b"motor stalled\n", 0, 14, True, ())
+    writer = ArchiveWriter(tmp_path / "archive", ArchiveLimits(1 << 30, 1 << 30))
+    writer.add(Source("robot-9", "old", 1), part)
+    with gateway(cluster.ros, "--archive", str(tmp_path / "archive")) as one:
+        one.wait_for_master("up")
+        answer = one.get("/v1/logs/old")
+    assert [chunk["text"] for chunk in answer["chunks"]] == ["motor stalled\n"]
+    assert "Its output there is read from" in answer["notes"][0]
 
 
 @pytest.mark.parametrize(

@@ -196,10 +196,12 @@ def test_a_host_that_has_lost_its_newest_bytes_doubles_nothing(rig):
     assert rig.chunks() == [(0, b"one\ntwo\nthree\n")]
 
 
-def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig):
+def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig, monkeypatch):
     rig.alpha.write(b"one\n")
     rig.master.silent.add(HOST)
     rig.collect(3)
+    assert len(rig.master.asked) == 1  # each request to it would wait for 10 s
+    monkeypatch.setattr("time.monotonic", lambda: 1e9)
     assert rig.said == ["the slave of alpha does not answer"]
     rig.master.silent.clear()
     rig.collect()

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rosrm.cli.commands.logs import Archive, open_archive
 from rosrm.cli.connection import ros_settings
 from rosrm.cli.options import CommonOptions, Domain
 from rosrm.cli.output.plain import echo
@@ -69,6 +70,7 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
         list[str] | None,
         typer.Option("--name", metavar="NAME", help="DNS name of this machine; repeatable."),
     ] = None,
+    archive: Archive = None,
     domain: Domain = None,
 ) -> None:
     """Serve a page about the cluster, and its state as JSON, until Ctrl-C.
@@ -84,7 +86,8 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     )  # fmt: skip
     _log_to_stderr()
     cluster = ctx.obj.cluster if isinstance(ctx.obj, CommonOptions) else None
-    gateway = Gateway(partial(_connect, ros_settings(ctx, domain), cluster))
+    open_archive(archive)  # refuses a directory that is none
+    gateway = Gateway(partial(_connect, ros_settings(ctx, domain), cluster), archive)
     with open_socket(settings) as listener:
         rights = "operators may act" if settings.is_acting else "it only reads"
         said = f"rosrm web: {url_of(listener, settings)}; {rights}"

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from rosrm.archive.reader import LogArchive
 from rosrm.errors import NoMaster
 from rosrm_web.changes import Broadcast, master_part
 from rosrm_web.listings import Listings
@@ -25,6 +27,10 @@ class Gateway:
     Each has a client of its own, so that a silent slave delays only those who read logs, and a
     request that waits does not delay the listings.
 
+    Args:
+        connect: returns a client of the master.
+        archive: directory of a log archive; None: there is none.
+
     Attributes:
         reading: listings, and the regular requests of the watcher.
         acting: requests that act, and explanations.
@@ -33,7 +39,8 @@ class Gateway:
         broadcast: passes changes to the readers of `/v1/changes`.
     """
 
-    def __init__(self, connect: Callable[[Notify], Client]) -> None:
+    def __init__(self, connect: Callable[[Notify], Client], archive: Path | None = None) -> None:
+        self._archive = archive
         self.reading = MasterLink("reading", connect)
         self.acting = MasterLink("acting", connect)
         self.logs = MasterLink("logs", connect)
@@ -42,6 +49,10 @@ class Gateway:
         self.broadcast = Broadcast()
         self.watcher.on_events.append(self.broadcast.send_events)
         self.watcher.on_master.append(lambda master: self.broadcast.send(master_part(master)))
+
+    def open_archive(self) -> LogArchive | None:
+        """Return the log archive as it is now, for the link that reads logs; raises `Refused`."""
+        return None if self._archive is None else LogArchive(self._archive)
 
     async def ask(self, link: MasterLink, request: Callable[[Client], T]) -> T:
         """Return the result of a request; without a master, refuse it at once.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, make_dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Final, get_type_hints
@@ -18,6 +18,7 @@ from rosrm.model.values import HostDescription
 from rosrm_web.watching import MOST_EVENTS, give_up_early
 
 if TYPE_CHECKING:
+    from rosrm.archive.reader import LogArchive
     from rosrm.client.client import Client
     from rosrm.model.rows import Listing
     from rosrm_web.gateway import Gateway
@@ -167,14 +168,18 @@ class Reading:
         """Read the output of a process, over restarts and migrations; `since` replaces `tail`."""
         selection = LogSelection(0 if since else tail, since, host)
         link = self._gateway.logs
-        read = partial(_read_log, process=process, selection=selection, link=link)
+        read = partial(
+            _read_log, process=process, selection=selection, link=link,
+            open_archive=self._gateway.open_archive,
+        )  # fmt: skip
         return _answer(await self._gateway.ask(link, read))
 
 
 def _read_log(
-    client: Client, process: str, selection: LogSelection, link: MasterLink
-) -> dict[str, Any]:
-    (reader,) = client.log_readers([process], selection)
+    client: Client, process: str, selection: LogSelection, link: MasterLink,
+    open_archive: Callable[[], LogArchive | None],
+) -> dict[str, Any]:  # fmt: skip
+    (reader,) = client.log_readers([process], selection, open_archive())
     chunks: list[dict[str, Any]] = []
     size = 0
     for chunk in reader.read():

@@ -210,7 +210,7 @@ class _Log:
     async def _begin(self, process: str) -> None:
         try:
             self._reader, content = await self._gateway.ask(
-                self._gateway.logs, partial(_open_log, process=process)
+                self._gateway.logs, partial(_open_log, process=process, gateway=self._gateway)
             )
         except RosrmError as error:
             self._add(str(error))
@@ -245,7 +245,10 @@ class _Log:
         return [line for line in lines if wanted in line]
 
 
-def _open_log(client: Client, process: str) -> tuple[LogReader, str]:
-    (reader,) = client.log_readers([process], LogSelection(_LINES, follow=True))
+def _open_log(client: Client, process: str, gateway: Gateway) -> tuple[LogReader, str]:
+    """Return a reader and the last lines, below sentences about parts that are not live."""
+    selection = LogSelection(_LINES, follow=True)
+    (reader,) = client.log_readers([process], selection, gateway.open_archive())
     text = b"".join(chunk.content for chunk in reader.read())
-    return reader, text.decode(errors="replace")
+    notes = [f"--- {note}\n" for note in gateway.logs.notes]
+    return reader, "".join(notes) + text.decode(errors="replace")
