@@ -70,12 +70,13 @@ def test_new_plugins_of_all_kinds_work_on_a_live_cluster(environment):
     """From an empty folder: write, install, test and check each, then run a master with all."""
     settings, state = environment.folder, environment.folder / "state"
     (settings / "cluster.yaml").write_text(f"state: {state / 'master'}\n", encoding="utf-8")
+    packages = [f"rosrm-my-{kind.value}" for kind in Kind]
     for kind in Kind:
-        name = f"my-{kind.value}"
-        done(environment, f"rosrm plugin new {kind.value} {name}")
-        package = environment.folder / f"rosrm-{name}"
-        done(environment, "pip install --quiet .", package)
-        done(environment, f"python -m pytest -q {package}", package)
+        done(environment, f"rosrm plugin new {kind.value} my-{kind.value}")
+    folders = " ".join(f"./{one}" for one in packages)
+    done(environment, f"pip install --quiet {folders}")
+    done(environment, f"python -m pytest -q --import-mode=importlib {folders}")
+    for package in (environment.folder / one for one in packages):
         files = sorted(path.name for path in package.glob("*.yaml"))
         done(environment, f"rosrm config check {' '.join(files)}", package)
         for path in package.glob("cluster.yaml"):
