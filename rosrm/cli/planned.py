@@ -43,14 +43,21 @@ def read_plan(path: str) -> ApplyResult | None:
     )
 
 
-def as_planned(planned: ApplyResult | None, request: Request) -> Request:
+def _print_warning(text: str) -> None:
+    echo(f"rosrm: {text}", err=True)
+
+
+def as_planned(
+    planned: ApplyResult | None, request: Request, warn: Callable[[str], None] = _print_warning
+) -> Request:
     """Return a request that is only made if a kept plan of it still holds.
 
-    It prints what differs by other readings, and returns the actions with the hosts planned now.
+    It returns the actions with the hosts planned now.
 
     Args:
         planned: the kept plan; None: there is none.
         request: the request without a condition.
+        warn: called with a phrase on each difference that stems from other readings.
     """
     if planned is None:
         return request
@@ -58,7 +65,7 @@ def as_planned(planned: ApplyResult | None, request: Request) -> Request:
     def checked(*, plan_only: bool = False) -> ApplyResult:
         now = request(plan_only=True)
         for text in differences(planned, now):
-            echo(f"rosrm: other readings than at the time of the plan: {text}", err=True)
+            warn(f"other readings than at the time of the plan: {text}")
         if plan_only:
             return now
         done = request()

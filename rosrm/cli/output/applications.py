@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from rich.table import Table
 from rich.text import Text
@@ -18,10 +18,15 @@ def actions(rows: Sequence[PlannedAction]) -> Table:
     """Return the table of a plan."""
     made = table("ACTION", "PROCESS", "HOST", "WHY")
     for row in rows:
-        moves = row.before and row.host and row.before != row.host
-        host = f"{row.before} -> {row.host}" if moves else row.host or row.before
-        made.add_row(row.action.value, Text(row.process), Text(host), Text(_why(row)))
+        made.add_row(*map(Text, action_cells(row)))
     return made
+
+
+def action_cells(row: PlannedAction) -> tuple[str, str, str, str]:
+    """Return action, process, host and reason of a planned action."""
+    moves = row.before and row.host and row.before != row.host
+    host = f"{row.before} -> {row.host}" if moves else row.host or row.before
+    return row.action.value, row.process, host, _why(row)
 
 
 def _why(row: PlannedAction) -> str:
@@ -37,23 +42,33 @@ def applications(rows: Sequence[ApplicationRow]) -> Table:
     """Return the table of `rosrm apps`."""
     made = table("NAME", "STATE", "VERSION", "RUNNING", "WHY", right=("VERSION", "RUNNING"))
     for row in rows:
-        made.add_row(
-            Text(row.name), state(row.state), str(row.version or "-"),
-            f"{row.running}/{row.processes}", Text(row.reason or _pending(row)),
-        )  # fmt: skip
+        name, condition, *others = application_cells(row)
+        made.add_row(Text(name), state(condition), *map(Text, others))
     return made
+
+
+def application_cells(row: ApplicationRow) -> tuple[str, str, str, str, str]:
+    """Return name, state, version, running processes and reason of an application."""
+    running = f"{row.running}/{row.processes}"
+    return row.name, row.state, str(row.version or "-"), running, row.reason or _pending(row)
 
 
 def versions(application: ApplicationRow) -> Table:
     """Return the table of `rosrm history`, the newest version first."""
     made = table("VERSION", "REQUESTED", "BY", "PROCESSES", "NOTE", right=("VERSION", "PROCESSES"))
+    for cells in version_cells(application):
+        made.add_row(*map(Text, cells))
+    return made
+
+
+def version_cells(application: ApplicationRow) -> Iterator[tuple[str, str, str, str, str]]:
+    """Yield number, time, principal, processes and note of each version, the newest first."""
     for row in reversed(application.versions):
         when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row.wall_time))
         given_up = f"given up: {row.given_up}" if row.given_up else ""
         wanted = _standing(application) if row.wanted else ""
         note = "; ".join(filter(None, (wanted, row.note, given_up)))
-        made.add_row(str(row.number), when, Text(row.by), str(row.processes), Text(note))
-    return made
+        yield str(row.number), when, row.by, str(row.processes), note
 
 
 def _standing(row: ApplicationRow) -> str:

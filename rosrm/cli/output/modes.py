@@ -16,12 +16,16 @@ def modes(rows: Sequence[ModeRow]) -> Table:
     """Return the table of `rosrm mode`."""
     made = table("MODE", "STATE", "APPLICATIONS", "SETTINGS", "WHEN", "WHY")
     for row in rows:
-        settings = "; ".join(
-            filter(None, (_amounts("limits", row.limits), _amounts("weights", row.weights)))
-        )
-        cells = (row.name, row.state, ", ".join(row.applications), settings, row.when, row.reason)
-        made.add_row(*map(Text, cells))
+        made.add_row(*map(Text, mode_cells(row)))
     return made
+
+
+def mode_cells(row: ModeRow) -> tuple[str, str, str, str, str, str]:
+    """Return name, state, applications, settings, condition and reason of a mode."""
+    settings = "; ".join(
+        filter(None, (_amounts("limits", row.limits), _amounts("weights", row.weights)))
+    )
+    return row.name, row.state, ", ".join(row.applications), settings, row.when, row.reason
 
 
 def _amounts(what: str, amounts: Mapping[str, float]) -> str:

@@ -175,13 +175,22 @@ class Acting:
 
 
 async def _application(request: Request) -> Target:
-    target = await _work(request)
-    if not target.application:
-        raise ConfigError(
-            f"{_WORK}: app: the name of the application is required. To run single processes, use "
-            "/v1/submit"
-        )
-    return target
+    return require_application(await _work(request), "/v1/submit")
+
+
+def require_application(target: Target, otherwise: str) -> Target:
+    """Return a target that is an application.
+
+    Args:
+        target: of a work file.
+        otherwise: what runs single processes, for the message.
+    """
+    if target.application:
+        return target
+    raise ConfigError(
+        f"{_WORK}: app: the name of the application is required, such as `app: navigation`. To run "
+        f"single processes, use {otherwise}"
+    )
 
 
 async def _work(request: Request) -> Target:
@@ -189,11 +198,12 @@ async def _work(request: Request) -> Target:
     media_type = request.headers.get("content-type", "").partition(";")[0].strip().lower()
     if media_type not in WORK_TYPES:
         raise ConfigError(f"a work file has the content type {' or '.join(WORK_TYPES)}")
-    check = partial(_checked, await request.body(), is_json=media_type == WORK_TYPES[0])
+    check = partial(checked_work_file, await request.body(), is_json=media_type == WORK_TYPES[0])
     return await asyncio.get_running_loop().run_in_executor(None, check)
 
 
-def _checked(body: bytes, *, is_json: bool) -> Target:
+def checked_work_file(body: bytes, *, is_json: bool) -> Target:
+    """Return the desired state in a work file that came over the network."""
     try:
         text = body.decode()
         root = _json(text) if is_json else parse(text, _WORK)

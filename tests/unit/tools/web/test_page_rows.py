@@ -5,7 +5,7 @@ from dataclasses import replace
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
+from rosrm.model.rows import DeviceRow, HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
 from rosrm_web.page.rows import changed, host_rows, problems, process_row
 
@@ -48,6 +48,13 @@ def test_a_host_shows_usage_limit_and_marks():
         "room=1",
     )
     assert (row["memory_share"], row["memory_limit"]) == (0.5, 0.8)
+
+
+def test_a_host_shows_its_devices():
+    """As `rosrm hosts` does."""
+    devices = (DeviceRow("camera", "front", holders=("slam#12",)), DeviceRow("gpu", "0", free=1.0))
+
+    assert host_rows([host("h", devices=devices)])["h"]["devices"] == "camera 0/1, gpu 1/1"
 
 
 def test_a_process_shows_why_it_is_not_well_in_one_line():

@@ -14,12 +14,14 @@ from nicegui import background_tasks, ui
 from rosrm.cli.output import explain
 from rosrm.client.logs import LogSelection
 from rosrm.errors import RosrmError
-from rosrm.wording import duration
+from rosrm.wording import duration, listed, percent
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
     from rosrm.client.logs import LogReader
+    from rosrm.model.rows import DeviceRow
     from rosrm_web.gateway import Gateway
+    from rosrm_web.page.live import Live
 
 #: Last lines of a log that are shown.
 _LINES: Final = 1000
@@ -74,15 +76,15 @@ class Dialog:
         self.name = ""
         with ui.dialog() as self.dialog:
             self.card = ui.card().classes("w-full max-w-screen-lg")
-        self._question = ui.dialog()
+        self._question = Question()
         with self.card, ui.row().classes("w-full items-center"):
-            self._title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+            self._title = title_of(self.dialog)
             ui.space()
             for action in actions:
-                ui.button(action.title, on_click=partial(self._confirm, action)).props(
+                ui.button(action.title, color=None, on_click=partial(self._confirm, action)).props(
                     "outline no-caps"
                 )
-            ui.button("Close", on_click=self.dialog.close).props("flat no-caps")
+            ui.button("Close", color=None, on_click=self.dialog.close).props("flat no-caps")
 
     def open(self, name: str) -> None:
         """Show the process or host of this name."""
@@ -90,24 +92,81 @@ class Dialog:
         self.dialog.open()
 
     async def _confirm(self, action: Action) -> None:
-        name, question = self.name, self._question
+        name = self.name
+        if not await self._question.ask(action.warning.format(name=name), action.title):
+            return
+        try:
+            message = await self._gateway.ask(
+                self._gateway.acting, lambda client: action.request(client, name)
+            )
+            ui.notify(message)
+        except RosrmError as error:
+            ui.notify(str(error), type="negative", multi_line=True, close_button="Close")
+        self._on_action()
+
+
+def title_of(dialog: ui.dialog) -> ui.label:
+    """Add a heading that names a dialog."""
+    title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+    dialog.props(f"aria-labelledby={title.html_id}")
+    return title
+
+
+class Question:
+    """A dialog that asks the user to confirm an action."""
+
+    def __init__(self) -> None:
+        self._dialog = ui.dialog()
+
+    async def ask(self, effect: str, title: str) -> bool:
+        """Return True if the user confirms an action with this effect."""
+        question = self._dialog
         if question.value:
-            return  # a second press, before the browser shows the question
+            return False  # a second press, before the browser shows the question
         question.clear()
         with question, ui.card():
-            ui.label(action.warning.format(name=name))
+            question.props(f"aria-labelledby={ui.label(effect).html_id}")
             with ui.row():
-                ui.button(action.title, on_click=lambda: question.submit(True)).props("no-caps")
-                ui.button("Do nothing", on_click=question.close).props("flat no-caps")
-        if await question:
-            try:
-                message = await self._gateway.ask(
-                    self._gateway.acting, lambda client: action.request(client, name)
-                )
-                ui.notify(message)
-            except RosrmError as error:
-                ui.notify(str(error), type="negative", multi_line=True, close_button="Close")
-            self._on_action()
+                ui.button(title, on_click=lambda: question.submit(True)).props("no-caps")
+                ui.button("Do nothing", color=None, on_click=question.close).props("flat no-caps")
+        return bool(await question)
+
+
+class HostDialog(Dialog):
+    """The labels and devices of a host.
+
+    Args:
+        gateway: sends the requests.
+        actions: buttons; (): the user may not act.
+        live: has the newest listing; is woken after an action.
+    """
+
+    def __init__(self, gateway: Gateway, actions: Sequence[Action], live: Live) -> None:
+        super().__init__(gateway, actions, live.wake)
+        self._live = live
+        with self.card:
+            self._body = ui.column().classes("w-full")
+
+    def open(self, name: str) -> None:
+        """Show the host of this name."""
+        super().open(name)
+        self._body.clear()
+        listing = self._live.listing
+        hosts = listing.hosts if listing is not None else ()
+        row = next((one for one in hosts if one.description.name == name), None)
+        if row is not None:
+            with self._body:
+                labels = [f"{key}={value}" for key, value in row.description.labels.items()]
+                ui.label(f"Labels: {', '.join(labels) or 'none'}")
+                show_table(("device", "state", "about"), list(map(_device, row.devices)), "Devices")
+
+
+def _device(row: DeviceRow) -> dict[str, str]:
+    held = f"held by {listed(row.holders)}" if row.holders else ""
+    free = "free" if row.free >= 1.0 else f"{percent(row.free)} % free" if row.free > 0.0 else ""
+    missing = f"missing: {row.missing}" if row.missing else ""
+    state = missing or ", ".join(filter(None, (free, held)))
+    return {"device": row.title, "state": state, "about": row.about}
 
 
 class ProcessDialog(Dialog):
@@ -163,15 +222,16 @@ def _show_explanation(explanation: Mapping[str, Any]) -> None:
         ui.label(explain.sentence(explanation["process"], decision).plain)
         ui.label(explain.needs(decision.get("need") or {}).plain)
         cells = [dict(zip(_SCORES, one, strict=True)) for one in explain.host_cells(decision)]
-        _table(_SCORES, cells, "Scores of the hosts, the lowest wins")
+        show_table(_SCORES, cells, "Scores of the hosts, the lowest wins")
     history = [
         {"ago": duration(one["elapsed"]), "kind": one["kind"], "message": one["message"]}
         for one in explanation.get("history") or ()
     ]
-    _table(("ago", "kind", "message"), history, "History")
+    show_table(("ago", "kind", "message"), history, "History")
 
 
-def _table(names: Sequence[str], cells: list[dict[str, str]], title: str) -> None:
+def show_table(names: Sequence[str], cells: list[dict[str, str]], title: str) -> None:
+    """Show cells with text as a small table."""
     columns = [
         {"name": name, "label": name.capitalize(), "field": name, "align": "left"} for name in names
     ]

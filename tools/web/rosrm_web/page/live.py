@@ -30,6 +30,9 @@ class Live:
 
     Attributes:
         listing: None: there is none yet.
+        applications: the newest listing with applications and modes; None: there is none.
+        readers_of_applications: functions of `join` that need `applications`; without any, they are
+            not read.
         events: the newest ones, the oldest first.
         on_change: called after each listing, and when the master is lost or back.
     """
@@ -38,6 +41,8 @@ class Live:
         self._gateway = gateway
         self._woken = asyncio.Event()
         self.listing: Listing | None = None
+        self.applications: Listing | None = None
+        self.readers_of_applications: set[Callable[[], None]] = set()
         self.events: deque[EventRow] = deque(maxlen=MOST_EVENTS)
         self.on_change: list[Callable[[], None]] = []
         self._task: asyncio.Task[None] | None = None
@@ -54,6 +59,7 @@ class Live:
     def leave(self, on_change: Callable[[], None]) -> None:
         """End the calls of a function; without any, nothing is read."""
         self.on_change.remove(on_change)
+        self.readers_of_applications.discard(on_change)
         if not self.on_change and self._task is not None:
             self._task.cancel()
             self._task = self.listing = None
@@ -77,7 +83,12 @@ class Live:
 
     async def _read(self) -> None:
         try:
-            self.listing = await self._gateway.list(hosts=True, processes=True)
+            if self.readers_of_applications:
+                self.listing = self.applications = await self._gateway.list(
+                    hosts=True, processes=True, applications=True, modes=True
+                )
+            else:
+                self.listing = await self._gateway.list(hosts=True, processes=True)
             if not self.events:
                 self.events.extend(await self._gateway.ask(self._gateway.reading, _newest))
         except RosrmError:

@@ -87,7 +87,9 @@ class Processes:
             self._search.props("dense clearable debounce=200")
             for title, is_open in (("Expand all", True), ("Collapse all", False)):
                 ui.button(
-                    title, on_click=lambda is_open=is_open: self._fold_all(is_open=is_open)
+                    title,
+                    color=None,
+                    on_click=lambda is_open=is_open: self._fold_all(is_open=is_open),
                 ).props("flat dense no-caps")
             self._count = ui.label().props("role=status")
         self._table = _Tree(on_open, self._toggle)

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from rosrm.cli.output.tables import free_devices
 from rosrm.model.rows import EventRow, HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.wording import counted, first_line, percent, size, words
 
@@ -74,8 +75,6 @@ def _host(row: HostRow) -> Row:
     others = [
         f"{name} {percent(one.usage)} %" for name, one in resources.items() if name not in usages
     ]
-    free = sum(one.free > 0 for one in row.devices)
-    devices = [f"{free} of {counted(len(row.devices), 'device')} free"] if row.devices else []
     return {
         "id": row.description.name,
         "host": row.description.name,
@@ -86,7 +85,8 @@ def _host(row: HostRow) -> Row:
         **{f"{name}_share": round(one.usage, 2) for name, one in usages.items()},
         **{f"{name}_limit": round(one.limit, 2) for name, one in usages.items()},
         "labels": ", ".join(f"{key}={value}" for key, value in row.description.labels.items()),
-        "more": ", ".join([*others, *devices]),
+        "devices": free_devices(row.devices),
+        "more": ", ".join(others),
     }
 
 

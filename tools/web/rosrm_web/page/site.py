@@ -11,6 +11,7 @@ from nicegui import app as nicegui_app
 
 from rosrm_web.master_link import Busy
 from rosrm_web.page import dialogs, rows, timeline_view, views
+from rosrm_web.page.applications import Applications
 from rosrm_web.page.live import Live
 from rosrm_web.page.processes import Processes
 from rosrm_web.page.timeline_feed import Feed
@@ -38,9 +39,14 @@ _STYLE: Final = """
 .body--dark { --rosrm-bar: #1f4e79; --rosrm-over: #7f1d1d; }
 .rosrm-grid { height: calc(100vh - 13rem); min-height: 16rem; }
 .rosrm-tools ~ .rosrm-grid { height: calc(100vh - 17rem); }
+.nicegui-content .rosrm-half { height: calc(50vh - 9rem); margin-bottom: 0.5rem; }
+.rosrm-work { font-family: monospace; background: transparent; border: 1px solid; padding: 0.5rem; }
 .rosrm-mark { display: inline-block; width: 1.2em; cursor: pointer; }
 .rosrm-bad { color: #b00020; font-weight: 700; }
 .rosrm-poor { color: #8a5a00; font-weight: 700; }
+.q-loading-bar { display: none; }
+.q-dialog__backdrop { z-index: 0; }
+.q-dialog__inner { z-index: 1; }
 .body--dark .rosrm-bad { color: #ff8a80; }
 .body--dark .rosrm-poor { color: #ffd180; }
 """
@@ -90,20 +96,21 @@ class Page:
         self._header(may_act=may_act)
         of_process, of_host = (dialogs.OF_PROCESS, dialogs.OF_HOST) if may_act else ((), ())
         self._process = dialogs.ProcessDialog(gateway, of_process, live.wake)
-        self._host = dialogs.Dialog(gateway, of_host, live.wake)
-        with ui.tabs() as self._tabs:
-            for name in ("hosts", "processes", "timeline", "events"):
+        self._host = dialogs.HostDialog(gateway, of_host, live)
+        with ui.tabs(on_change=self._show_tab).classes("max-w-full") as self._tabs:
+            for name in ("hosts", "processes", "timeline", "applications", "events"):
                 ui.tab(name, name.capitalize()).props("no-caps")
         panels = ui.tab_panels(self._tabs, value="hosts", keep_alive=True, animated=False)
         with panels.classes("w-full"):
             with ui.tab_panel("hosts").classes("p-0"):
-                on_host = self._host.open if may_act else None
-                self._hosts = views.Table(views.HOSTS, "Hosts", on_host)
+                self._hosts = views.Table(views.HOSTS, "Hosts", self._host.open)
             with ui.tab_panel("processes").classes("p-0"):
                 self._processes = Processes(self._process.open)
             with ui.tab_panel("timeline").classes("p-0"):
                 self._timeline = timeline_view.Timeline(feed, live, self._process.open)
                 self._tabs.on_value_change(self._show_timeline)
+            with ui.tab_panel("applications").classes("p-0"):
+                self._applications = Applications(gateway, live, may_act=may_act)
             with ui.tab_panel("events").classes("p-0"):
                 self._events = views.Table(views.EVENTS, "Events")
         self._problems: list[rows.Problem] = []
@@ -114,7 +121,15 @@ class Page:
             self._state = ui.label().props("role=status aria-live=polite")
             ui.space()
             ui.label("operator" if may_act else "read-only")
+        self._said = ui.label().classes("sr-only").props("role=status")
         self._strip = ui.row().classes("w-full").props('role=region aria-label="Problems"')
+
+    def _show_tab(self) -> None:
+        if self._tabs.value == "applications":
+            self._live.readers_of_applications.add(self.update)
+            self._live.wake()
+        else:
+            self._live.readers_of_applications.discard(self.update)
 
     def update(self) -> None:
         """Show the newest listing and events."""
@@ -125,6 +140,8 @@ class Page:
             return
         self._hosts.show(rows.host_rows(listing.hosts))
         self._processes.show(listing.processes)
+        if self._live.applications is not None:
+            self._applications.show(self._live.applications)
         self._events.show(rows.event_rows(self._live.events, _SHOWN_EVENTS))
         self._timeline.update()
         found = rows.problems(listing)
@@ -137,6 +154,7 @@ class Page:
     def _show_problems(self, found: list[rows.Problem]) -> None:
         self._problems = found
         self._strip.clear()
+        self._said.text = f"Problems: {', '.join(one.text for one in found) or 'none'}"
         with self._strip:
             for problem in found:
                 button = ui.button(problem.text, on_click=partial(self._filter, problem))

@@ -53,7 +53,8 @@ HOSTS: Final = (
     usage("cpu", "CPU"),
     usage("memory"),
     usage("disk"),
-    column("more", "Other resources", width=180),
+    column("more", "Other resources", width=150),
+    column("devices", width=150),
     column("labels", flex=1, minWidth=160),
 )
 EVENTS: Final = (
