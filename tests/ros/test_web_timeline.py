@@ -91,7 +91,7 @@ def test_a_bar_opens_its_process(page):
 
 
 def test_earlier_looks_back_and_now_follows_again(page):
-    """What began later is not shown in the look back."""
+    """The look back shows no run that began later."""
     text(page, "stays").wait_for()
     page.get_by_role("button", name="Earlier").click()
     page.get_by_text("looking back").wait_for()

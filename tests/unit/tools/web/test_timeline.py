@@ -139,7 +139,7 @@ def test_names_narrow_the_picture():
 
 
 def test_a_look_back_shows_what_was_then():
-    """What began later is not there, and what still runs is."""
+    """Runs that began later are missing, and runs that have not ended are there."""
     lines = (*RUNS, (100, "assigned", "q", "b"))
     made = drawn(*lines, processes=[process("p"), process("q")], now=200.0, end=70.0)
 

@@ -15,7 +15,7 @@ from rosrm_web.page.timeline import Picture
 #: Rows of the height of the picture, so that few bars are not too high.
 _LEAST_ROWS: Final = 12
 #: Rows that are visible at once; a slider shows the others.
-_MOST_ROWS: Final = 60
+_MOST_ROWS: Final = 30
 #: Colours of bars, in light and in dark, in the order of `STYLES`.
 COLOURS: Final = (
     ("#9fc5e8", "#2b5f94"), ("#a8dadc", "#2f6f73"), ("#cdb4f0", "#5b3f8c"), ("#ffd180", "#7a5200"),

@@ -23,7 +23,7 @@ _WINDOWS: Final = {60.0: "1 min", 300.0: "5 min", 3600.0: "1 h", 86_400.0: "1 da
 #: Seconds after which states are drawn again without an event, e.g. of a host that is silent.
 _OLD: Final = 5.0
 STYLE: Final = f"""
-.rosrm-timeline {{ height: calc(100vh - 27rem); min-height: 18rem; }}
+.rosrm-timeline {{ height: calc(100vh - 27rem); min-height: 22rem; }}
 .rosrm-marks .rosrm-grid {{ height: 14rem; min-height: 0; }}
 .rosrm-chip {{ display: inline-block; width: 1rem; height: 0.8rem; border-radius: 2px; }}
 {timeline_chart.style()}
