@@ -1,11 +1,16 @@
 """Cost of the HTTP gateway beside a master with 100 hosts and 2,000 processes.
 
 The master is real, the slaves are simulated (`benchmarks/simulated_slaves.py`), and `rosrm web` is
-the real command with one reader of `/v1/changes`:
+the real command with one reader of `/v1/changes`. The browser is Chromium, driven by Playwright:
 
 - `hosts_ms`, `processes_ms`, `metrics_ms`: median time of an answer over HTTP.
-- `update_ms`: median time from a request to the master until its event is in the stream.
-- `idle_cpu`: cores that the gateway uses while nothing changes; `pss_mib`: its memory.
+- `stream_ms`: median time from a request to the master until its event is in the stream.
+- `first_paint_ms`: median time from the begin of the navigation, with an empty cache, until the
+  first rows of the table of hosts are drawn; `again_ms`: the same with a filled cache.
+- `tab_ms`: time from the click on the tab of the processes until their first rows are drawn.
+- `update_ms`: median time from a request to the master until the page shows the change.
+- `idle_cpu`: cores that the gateway uses with a page open while nothing changes; `pss_mib`: its
+  memory then.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from __future__ import annotations
 import argparse
 import http.client
 import os
+import shutil
 import signal
 import statistics
 import subprocess
@@ -25,6 +31,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
+from playwright.sync_api import Browser, Page, sync_playwright
 
 from benchmarks.machine import parser, print_report, say
 from benchmarks.scale import Crowd
@@ -39,7 +46,17 @@ from rosrm.testing.local_cluster import LocalCluster
 _REQUESTS = 10
 #: Seconds between two requests, beyond the time for which the gateway uses a listing again.
 _PAUSE = 0.3
-_PATIENCE = 60.0
+_PATIENCE = 120.0
+#: Processes of one request.
+_AT_ONCE = 200
+#: Openings of the page for `first_paint_ms`.
+_PAINTS = 5
+#: In the page: the milliseconds since its navigation once rows are there, after the next frame.
+_DRAWN = """() => document.querySelector('[aria-label=Hosts] .ag-row .ag-cell')
+    && new Promise(done => requestAnimationFrame(() => done(performance.now())))"""
+_TAB_DRAWN = "() => document.querySelector('[aria-label=Processes] .ag-row .ag-cell')"
+_CORDONED = """host => [...document.querySelectorAll('[aria-label=Hosts] .ag-row')]
+    .some(row => row.textContent.includes(host) && row.textContent.includes('cordoned'))"""
 #: States of a process before its start; for the gateway only the number of rows matters.
 _BEFORE = frozenset({"queued", "assigned", "starting"})
 
@@ -81,7 +98,7 @@ def answer_ms(port: int, path: str) -> float:
     return statistics.median(took)
 
 
-def update_ms(cluster: LocalCluster, stream: http.client.HTTPResponse) -> float:
+def stream_ms(cluster: LocalCluster, stream: http.client.HTTPResponse) -> float:
     """Return the median time from a request until its event is in the stream."""
     took = []
     for number in range(_REQUESTS):
@@ -93,6 +110,58 @@ def update_ms(cluster: LocalCluster, stream: http.client.HTTPResponse) -> float:
         took.append(1e3 * (time.monotonic() - begun))
         cluster.client.set_host_state(host, "uncordon")
     return statistics.median(took)
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """Yield Chromium; its sandbox needs a user that is not root."""
+    path = shutil.which("chromium") or shutil.which("chromium-browser")
+    if path is None:
+        raise RosrmError("this machine has no Chromium: apt-get install chromium")
+    with sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
+        try:
+            yield chromium
+        finally:
+            chromium.close()
+
+
+def paint_ms(page: Page, url: str) -> float:
+    """Return the time from the begin of the navigation until rows of the first table are drawn."""
+    page.goto(url, wait_until="commit")
+    return float(page.wait_for_function(_DRAWN, timeout=1e3 * _PATIENCE).json_value())
+
+
+def of_page(cluster: LocalCluster, page: Page, number: int) -> float:
+    """Return the time from a request until the page shows its effect on a host."""
+    host, begun = f"sim{number + 1:05d}", time.monotonic()
+    cluster.client.set_host_state(host, "cordon")
+    page.wait_for_function(_CORDONED, arg=host, timeout=1e3 * _PATIENCE)
+    took = 1e3 * (time.monotonic() - begun)
+    cluster.client.set_host_state(host, "uncordon")
+    return took
+
+
+def in_browser(cluster: LocalCluster, chromium: Browser, url: str) -> tuple[Page, dict[str, float]]:
+    """Return an open page, and what the browser measured."""
+    cold, warm = [], []
+    for _ in range(_PAINTS):
+        page = chromium.new_context().new_page()
+        cold.append(paint_ms(page, url))
+        warm.append(paint_ms(page, url))
+        page.context.close()
+    page = chromium.new_context(viewport={"width": 1280, "height": 4000}).new_page()
+    paint_ms(page, url)
+    updates = [of_page(cluster, page, number) for number in range(_REQUESTS)]
+    begun = time.monotonic()
+    page.get_by_role("tab", name="Processes").click()
+    page.wait_for_function(_TAB_DRAWN, timeout=1e3 * _PATIENCE)
+    return page, {
+        "first_paint_ms": statistics.median(cold),
+        "again_ms": statistics.median(warm),
+        "update_ms": statistics.median(updates),
+        "tab_ms": 1e3 * (time.monotonic() - begun),
+    }
 
 
 def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
@@ -107,7 +176,9 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
         opened.callback(crowd.close)
         crowd.start(arguments.hosts, 1)
         names = [f"process_{number}" for number in range(arguments.processes)]
-        cluster.client.submit([ProcessSpec(name, command=("true",)) for name in names])
+        for start in range(0, len(names), _AT_ONCE):  # a busy machine needs longer for all of them
+            part = names[start : start + _AT_ONCE]
+            cluster.client.submit([ProcessSpec(name, command=("true",)) for name in part])
         cluster.wait_until(
             f"{len(names)} processes are placed",
             lambda view: not any(row.state in _BEFORE for row in view.processes),
@@ -123,8 +194,11 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
             "hosts_ms": answer_ms(port, "/v1/hosts"),
             "processes_ms": answer_ms(port, "/v1/processes"),
             "metrics_ms": answer_ms(port, "/metrics"),
-            "update_ms": update_ms(cluster, stream),
+            "stream_ms": stream_ms(cluster, stream),
         }
+        chromium = opened.enter_context(browser())
+        _page, seen = in_browser(cluster, chromium, f"http://127.0.0.1:{port}/")
+        figures |= seen
         before, begun = sum(process.cpu_times()[:2]), time.monotonic()
         time.sleep(arguments.seconds)
         used = sum(process.cpu_times()[:2]) - before

@@ -87,7 +87,7 @@ def test_without_a_directory_nothing_is_written():
 
 
 def test_a_directory_that_cannot_be_used_is_logged_once(tmp_path, caplog):
-    """The slave goes on, tries again, and says when the file is written again."""
+    """The slave tries again, and logs when the file is written again."""
     caplog.set_level(logging.INFO)
     directory = tmp_path / "collector"
     made = Textfile(directory, "h")

@@ -177,7 +177,7 @@ def test_a_reader_that_takes_nothing_is_ended(monkeypatch):
 
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
 def test_a_handshake_that_never_ends_is_dropped(monkeypatch, tmp_path):
-    """It counts as a connection, too; a client that finishes it is answered."""
+    """A handshake counts as a connection; a client that finishes it is answered."""
     monkeypatch.setattr(connections, "HEAD_TIMEOUT", 1.0)
     file = tmp_path / "both.pem"
     subprocess.run(

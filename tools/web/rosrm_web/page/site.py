@@ -6,6 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from fastapi import Depends
+from fastapi.middleware.gzip import GZipMiddleware
 from nicegui import Client, ui
 from nicegui import app as nicegui_app
 
@@ -16,10 +17,12 @@ from rosrm_web.page.live import Live
 from rosrm_web.page.processes import Processes
 from rosrm_web.page.timeline_feed import Feed
 from rosrm_web.page.tree import Choice
+from rosrm_web.page.utilities import UTILITIES
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
     from nicegui.events import ValueChangeEventArguments
+    from starlette.types import ASGIApp
 
     from rosrm_web.gateway import Gateway
 
@@ -59,7 +62,16 @@ def mount(app: FastAPI, gateway: Gateway) -> None:
     room = [Depends(partial(_check_room, live))]
     page = ui.page("/", title="rosrm", dark=None, reconnect_timeout=_ABSENCE, dependencies=room)
     page(partial(_page, gateway, live, feed))
-    ui.run_with(app, show_welcome_message=False, language="en-US", reconnect_timeout=_PINGS)
+    ui.run_with(
+        app, show_welcome_message=False, language="en-US", reconnect_timeout=_PINGS,
+        gzip_middleware_factory=_quickly,
+        tailwind=False,  # `UTILITIES` replaces it
+    )  # fmt: skip
+
+
+def _quickly(app: ASGIApp) -> GZipMiddleware:
+    """Compress answers by a fast level: the highest one takes ten times as long."""
+    return GZipMiddleware(app, compresslevel=1)
 
 
 async def _check_room(live: Live) -> None:
@@ -91,7 +103,7 @@ class Page:
 
     def __init__(self, gateway: Gateway, live: Live, feed: Feed, *, may_act: bool) -> None:
         self._gateway, self._live = gateway, live
-        ui.add_css(_STYLE + timeline_view.STYLE)
+        ui.add_css(UTILITIES + _STYLE + timeline_view.STYLE)
         ui.colors(primary="#1b4f8a", negative="#b00020")
         self._header(may_act=may_act)
         of_process, of_host = (dialogs.OF_PROCESS, dialogs.OF_HOST) if may_act else ((), ())
