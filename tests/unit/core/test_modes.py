@@ -13,7 +13,14 @@ from rosrm.core.master.modes.switching import mode_rows
 from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.modes import Mode, Trigger
-from rosrm.model.values import HostLossPolicy, ProcessSpec, StartOrder
+from rosrm.model.values import (
+    HostLossPolicy,
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ProcessSpec,
+    StartOrder,
+)
 from tests.unit.core.cluster import Cluster, Eq1, Machine, job, movable, process
 from tests.unit.core.test_applications import actions, new, row
 
@@ -161,6 +168,21 @@ def test_a_mode_whose_process_fails_is_left_again() -> None:
     assert failed.startswith("the mode docked is not reached, and exploring returns: charger ")
     (row,) = [one for one in mode_rows(cluster.state) if one.name == "docked"]
     assert row.reason.startswith("charger ")
+
+
+def test_a_mode_whose_new_application_crashes_is_left_again() -> None:
+    """The first version of an application has none to return to, but the mode has."""
+    cluster = in_mode("exploring", EXPLORING, DOCKED)
+    switch(cluster, "docked", 0.0)
+    crashed = InstanceId("charger", cluster["charger"].owner)
+    (host,) = cluster.where("charger")
+    cluster.report(host, InstanceStatus(crashed, InstanceState.BACKOFF, message="exit code 1"))
+    cluster.wait(6.0)
+    (failed,) = cluster.recorded("mode_failed")
+    why = "charger does not run well: exit code 1"
+    assert failed == f"the mode docked is not reached, and exploring returns: {why}"
+    assert states(cluster) == {"exploring": "in force", "docked": ""}
+    assert running(cluster) == {"planner", "driver", "mapper"}
 
 
 def test_a_mode_whose_process_finds_no_room_for_long_is_left_again() -> None:

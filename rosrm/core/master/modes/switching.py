@@ -28,7 +28,7 @@ from rosrm.core.master.modes.settings import apply_settings, weighted
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.modes import Modes
-from rosrm.core.master.state.process import ProcessPhase
+from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.errors import RosrmError
 from rosrm.model.applications import PlannedAction, Target
 from rosrm.model.event_kinds import EventKind
@@ -190,8 +190,20 @@ def _faults(state: MasterState, mode: Mode, now: float) -> Iterator[str]:
             known = state.processes.get(process)
             if known is not None and known.phase is ProcessPhase.FAILED:
                 yield f"{process} has failed: {known.reason}"
+            elif known is not None and _crashes(state, known):
+                yield f"{process} does not run well: {known.reason}"
             elif known is not None and has_waited_too_long(state, known, state.modes.began, now):
                 yield f"{process} finds no host: {known.reason}"
+
+
+def _crashes(state: MasterState, process: Process) -> bool:
+    """Return True if a process that the switch has started is in back-off.
+
+    The first version of an application has none to return to, so its work ends with the crash. A
+    restarted master does not know which processes the switch has started.
+    """
+    is_new = -inf < state.modes.began <= process.started_at
+    return is_new and process.phase is ProcessPhase.BACKOFF
 
 
 def _handle_fault(state: MasterState, mode: Mode, fault: str, now: float) -> None:
