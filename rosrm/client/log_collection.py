@@ -6,6 +6,7 @@ new output again after `every`, and for a quiet one less and less often.
 
 from __future__ import annotations
 
+import errno
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -103,6 +104,10 @@ class LogCollector:
                 self._take(self._list(master))  # raises if the master is the silent one
             except Refused as refusal:
                 self._settle(host, process, refusal)
+            except OSError as error:
+                if error.errno != errno.ENAMETOOLONG:
+                    raise
+                self._settle(host, process, Refused("its name is too long for a file", "invalid"))
             else:
                 self._said.pop(host, None)
         self._archive.apply_limits()

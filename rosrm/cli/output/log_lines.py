@@ -22,6 +22,8 @@ Marks = Sequence[tuple[float, int, int]]
 Piece = tuple[float, bytes]
 #: Bytes after which an endless line is divided.
 _LONGEST_LINE: Final = 1 << 16
+#: Unix time before which times of output are (year 2242).
+_LATEST: Final = float(1 << 33)
 
 
 def show(pieces: Iterable[Piece]) -> None:
@@ -75,7 +77,9 @@ class LogStream:
 
     def write(self, chunk: LogChunk) -> None:
         """Add bytes of the process."""
-        content, offset, marks = chunk.content, chunk.offset, chunk.marks
+        content, offset = chunk.content, chunk.offset
+        # Times come from other hosts, and may be NaN.
+        marks = [mark for mark in chunk.marks if 0.0 < mark[0] < _LATEST]
         if chunk.is_first:
             self.close()
             self._host, self._number, self._is_new = chunk.host, chunk.number, self.wrote

@@ -294,6 +294,15 @@ def test_no_name_leads_out_of_the_archive(tmp_path, name):
     assert {path.name for path in tmp_path.iterdir()} == {"alpha", "archive"}
 
 
+def test_a_name_that_is_too_long_holds_up_no_other_log(rig):
+    name = "/" * 100
+    rig.alpha.read_log = lambda *_: LogPart(1, (1,), b"one\n", 0, 4, True, ())
+    rig.master.processes = [process(name, host=HOST), process(PROCESS, host=HOST)]
+    rig.collect()
+    assert rig.said == [f"the log of {name} on alpha: its name is too long for a file"]
+    assert rig.chunks() == [(0, b"one\n")]
+
+
 PARTS = [
     {"number": 2}, {"next_offset": 99}, {"content": b"x" * (1 << 20), "next_offset": 1 << 20},
 ]  # fmt: skip

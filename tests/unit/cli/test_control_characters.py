@@ -122,7 +122,7 @@ def test_only_a_terminal_gets_output_without_control_characters(
     given = []
     monkeypatch.setattr(log_lines, "is_terminal", lambda: is_terminal)
     monkeypatch.setattr(
-        "rosrm.cli.log_copies.copy_logs", lambda _, streams, __: given.extend(streams)
+        "rosrm.cli.log_copies.copy_logs", lambda _, streams, *__: given.extend(streams)
     )
     rosrm("logs", "talker", *options)
     assert [stream.raw for stream in given] == [raw]

@@ -80,6 +80,14 @@ def test_a_time_far_from_that_of_the_supervisor_is_not_used():
     assert found == NOON + 3600.0
 
 
+@pytest.mark.parametrize("time", [float("nan"), float("inf"), -1.0, 1e300])
+def test_impossible_times_count_as_unknown(time):
+    """They come from other hosts."""
+    stream = LogStream("nav", timestamps=True)
+    stream.write(LogChunk("nav", "alpha", 3, b"one\n", 0, 0, True, [(time, 0, 77), (time, 4, 0)]))
+    assert [text for _, text in stream.take()] == [b"? one\n"]
+
+
 def test_another_program_begins_without_a_level():
     text = b"[ERROR] [1700000000.2] [nav]: failed\nplain\n"
     marks = [(NOON, 37, 77), (NOON, len(text), 0)]
