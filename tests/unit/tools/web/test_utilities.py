@@ -9,7 +9,7 @@ from rosrm_web import page
 from rosrm_web.page.utilities import UTILITIES
 
 #: Classes of Quasar, which is loaded.
-QUASAR = {"items-center", "text-h6"}
+QUASAR = {"text-h6"}
 
 
 def test_each_class_of_the_page_has_a_rule():

@@ -20,6 +20,7 @@ UTILITIES: Final = """
 .gap-2 { gap: 0.5rem; }
 .gap-x-3 { column-gap: 0.75rem; }
 .gap-y-1 { row-gap: 0.25rem; }
+.items-center { align-items: center; }
 .whitespace-pre-line { white-space: pre-line; }
 .sr-only {
   position: absolute; width: 1px; height: 1px; margin: -1px; padding: 0; overflow: hidden;
