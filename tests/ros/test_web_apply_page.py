@@ -12,6 +12,7 @@ from rosrm.config.work import load_application
 from tests.ros.browser_kit import browser, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host
 from tests.ros.web_kit import gateway
+from tests.waiting import wait_until
 
 TOKEN = "0123456789abcdef01234567"
 #: A name cannot have HTML, but a reason can.
@@ -79,8 +80,11 @@ def plan(page: Any, text: str) -> Any:
     return dialog
 
 
-def test_a_work_file_is_planned_and_applied(page, cluster):
-    """The plan begins nothing; its button starts at once, and asks before it stops anything."""
+def test_a_work_file_is_planned_and_applied(page, cluster, web):
+    """The plan begins nothing; its button starts at once, and asks before it stops anything.
+
+    The gateway logs who has applied it.
+    """
     dialog = plan(page, work("nav", "planner", "mapper"))
     dialog.get_by_role("cell", name="planner").wait_for()
     assert not cluster.client.list(applications=True).applications
@@ -100,6 +104,11 @@ def test_a_work_file_is_planned_and_applied(page, cluster):
     question.get_by_role("button", name="Apply: start 1, stop 1").click()
     cluster.wait("camera", "running")
     cluster.ended("mapper")
+    wait_until(
+        lambda: any("ada: page: start 1, stop 1 of nav" in line for line in web.said),
+        "the gateway logs the change",
+        seen=lambda: web.said,
+    )
 
 
 def test_an_application_is_reverted_by_its_plan(page, cluster):

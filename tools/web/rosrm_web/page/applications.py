@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 
 from nicegui import background_tasks, ui
@@ -15,7 +15,6 @@ from rosrm_web.page.views import STATE, Table, column
 if TYPE_CHECKING:
     from rosrm.model.rows import Listing
     from rosrm_web.gateway import Gateway
-    from rosrm_web.page.live import Live
 
 _APPLICATIONS: Final = (
     column("name", width=200, sort="asc"),
@@ -39,16 +38,18 @@ class Applications:
 
     Args:
         gateway: sends the requests.
-        live: is woken after a change.
+        on_action: as of `Plan`.
         may_act: the user is an operator, and the gateway acts.
     """
 
-    def __init__(self, gateway: Gateway, live: Live, *, may_act: bool) -> None:
+    def __init__(
+        self, gateway: Gateway, on_action: Callable[[str], None], *, may_act: bool
+    ) -> None:  # fmt: skip
         self._rows: Mapping[str, ApplicationRow] = {}
-        self._application = ApplicationDialog(gateway, live.wake, may_act=may_act)
-        self._mode = ModeDialog(gateway, live.wake)
+        self._application = ApplicationDialog(gateway, on_action, may_act=may_act)
+        self._mode = ModeDialog(gateway, on_action)
         if may_act:
-            work = WorkDialog(gateway, live.wake)
+            work = WorkDialog(gateway, on_action)
             with ui.row().classes("px-2 rosrm-tools"):
                 ui.button("Plan a change", color=None, on_click=work.open).props(
                     "flat dense no-caps"

@@ -66,11 +66,11 @@ class Dialog:
     Args:
         gateway: sends the requests.
         actions: buttons; (): the user may not act.
-        on_action: called after an action.
+        on_action: called with a description of an action, after it was requested.
     """
 
     def __init__(
-        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[], None]
+        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[str], None]
     ) -> None:
         self._gateway, self._on_action = gateway, on_action
         self.name = ""
@@ -102,7 +102,7 @@ class Dialog:
             ui.notify(message)
         except RosrmError as error:
             ui.notify(str(error), type="negative", multi_line=True, close_button="Close")
-        self._on_action()
+        self._on_action(f"{action.title.lower()} {name}")
 
 
 def title_of(dialog: ui.dialog) -> ui.label:
@@ -138,11 +138,15 @@ class HostDialog(Dialog):
     Args:
         gateway: sends the requests.
         actions: buttons; (): the user may not act.
-        live: has the newest listing; is woken after an action.
+        on_action: as of `Dialog`.
+        live: has the newest listing.
     """
 
-    def __init__(self, gateway: Gateway, actions: Sequence[Action], live: Live) -> None:
-        super().__init__(gateway, actions, live.wake)
+    def __init__(
+        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[str], None],
+        live: Live,
+    ) -> None:  # fmt: skip
+        super().__init__(gateway, actions, on_action)
         self._live = live
         with self.card:
             self._body = ui.column().classes("w-full")
@@ -173,7 +177,7 @@ class ProcessDialog(Dialog):
     """The explanation and the logs of a process."""
 
     def __init__(
-        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[], None]
+        self, gateway: Gateway, actions: Sequence[Action], on_action: Callable[[str], None]
     ) -> None:
         super().__init__(gateway, actions, on_action)
         with self.card:

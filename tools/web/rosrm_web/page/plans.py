@@ -13,6 +13,7 @@ from rosrm.cli.output import applications
 from rosrm.cli.planned import as_planned
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.model.applications import ApplicationRow, ApplyResult, Target
+from rosrm.wording import listed
 from rosrm_web.acting import checked_work_file, require_application
 from rosrm_web.page.dialogs import Question, show_table, title_of
 from rosrm_web.page.plan_rows import interruptions, summary
@@ -49,10 +50,10 @@ class Plan:
 
     Args:
         gateway: sends the requests.
-        on_action: called after a change has begun.
+        on_action: called with a description of a change, after it has begun.
     """
 
-    def __init__(self, gateway: Gateway, on_action: Callable[[], None]) -> None:
+    def __init__(self, gateway: Gateway, on_action: Callable[[str], None]) -> None:
         self._gateway, self._on_action = gateway, on_action
         self._question = Question()
         self._area = ui.column().classes("w-full").props("aria-live=polite")
@@ -101,7 +102,8 @@ class Plan:
         with self._area:
             for text in (done.message, *notes):
                 ui.label(text).props("role=status")
-        self._on_action()
+        names = listed(dict.fromkeys(one.application for one in plan.actions))
+        self._on_action(f"{summary(plan.actions)} of {names}")
 
     async def _ask(self, request: Callable[[Client], ApplyResult]) -> ApplyResult:
         return await self._gateway.ask(self._gateway.acting, request)
@@ -110,7 +112,7 @@ class Plan:
 class _ChangeDialog:
     """A dialog with a title, a part of its own, and a plan."""
 
-    def __init__(self, gateway: Gateway, on_action: Callable[[], None]) -> None:
+    def __init__(self, gateway: Gateway, on_action: Callable[[str], None]) -> None:
         with ui.dialog() as self.dialog, ui.card().classes("w-full max-w-screen-lg"):
             with ui.row().classes("w-full items-center"):
                 self.title = title_of(self.dialog)
@@ -123,7 +125,7 @@ class _ChangeDialog:
 class WorkDialog(_ChangeDialog):
     """The plan of a work file that the operator pastes or loads."""
 
-    def __init__(self, gateway: Gateway, on_action: Callable[[], None]) -> None:
+    def __init__(self, gateway: Gateway, on_action: Callable[[str], None]) -> None:
         super().__init__(gateway, on_action)
         self.title.text = "Plan of a change"
         with self.body:
@@ -157,7 +159,7 @@ class ApplicationDialog(_ChangeDialog):
     """The versions of an application; operators may revert to one, or cancel the application."""
 
     def __init__(
-        self, gateway: Gateway, on_action: Callable[[], None], *, may_act: bool
+        self, gateway: Gateway, on_action: Callable[[str], None], *, may_act: bool
     ) -> None:  # fmt: skip
         super().__init__(gateway, on_action)
         self._may_act = may_act

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
@@ -37,6 +38,7 @@ _ABSENCE: Final = 30.0
 _PINGS: Final = 15.0
 #: Events in the table.
 _SHOWN_EVENTS: Final = 200
+
 _STYLE: Final = """
 :root { --rosrm-bar: #9fc5e8; --rosrm-over: #f4a6a6; }
 .body--dark { --rosrm-bar: #1f4e79; --rosrm-over: #7f1d1d; }
@@ -53,6 +55,9 @@ _STYLE: Final = """
 .body--dark .rosrm-bad { color: #ff8a80; }
 .body--dark .rosrm-poor { color: #ffd180; }
 """
+
+
+_log = logging.getLogger("rosrm.web")
 
 
 def mount(app: FastAPI, gateway: Gateway) -> None:
@@ -85,7 +90,8 @@ async def _check_room(live: Live) -> None:
 def _page(gateway: Gateway, live: Live, feed: Feed) -> None:
     client = ui.context.client
     request = client.request
-    page = Page(gateway, live, feed, may_act=bool(request.scope["may_act"]))
+    user, may_act = request.scope["user"], bool(request.scope["may_act"])
+    page = Page(gateway, live, feed, user=user.name, may_act=may_act)
     client.on_delete(page.leave)
     live.join(page.update)
     page.update()
@@ -98,17 +104,20 @@ class Page:
         gateway: sends the requests.
         live: has the newest listing.
         feed: has the events of the timeline.
+        user: name of the user, for the log.
         may_act: the user is an operator, and the gateway acts.
     """
 
-    def __init__(self, gateway: Gateway, live: Live, feed: Feed, *, may_act: bool) -> None:
-        self._gateway, self._live = gateway, live
+    def __init__(
+        self, gateway: Gateway, live: Live, feed: Feed, *, user: str, may_act: bool
+    ) -> None:  # fmt: skip
+        self._gateway, self._live, self._user = gateway, live, user
         ui.add_css(UTILITIES + _STYLE + timeline_view.STYLE)
         ui.colors(primary="#1b4f8a", negative="#b00020")
         self._header(may_act=may_act)
         of_process, of_host = (dialogs.OF_PROCESS, dialogs.OF_HOST) if may_act else ((), ())
-        self._process = dialogs.ProcessDialog(gateway, of_process, live.wake)
-        self._host = dialogs.HostDialog(gateway, of_host, live)
+        self._process = dialogs.ProcessDialog(gateway, of_process, self._acted)
+        self._host = dialogs.HostDialog(gateway, of_host, self._acted, live)
         with ui.tabs(on_change=self._show_tab).classes("max-w-full") as self._tabs:
             for name in ("hosts", "processes", "timeline", "applications", "events"):
                 ui.tab(name, name.capitalize()).props("no-caps")
@@ -122,7 +131,7 @@ class Page:
                 self._timeline = timeline_view.Timeline(feed, live, self._process.open)
                 self._tabs.on_value_change(self._show_timeline)
             with ui.tab_panel("applications").classes("p-0"):
-                self._applications = Applications(gateway, live, may_act=may_act)
+                self._applications = Applications(gateway, self._acted, may_act=may_act)
             with ui.tab_panel("events").classes("p-0"):
                 self._events = views.Table(views.EVENTS, "Events")
         self._problems: list[rows.Problem] = []
@@ -135,6 +144,10 @@ class Page:
             ui.label("operator" if may_act else "read-only")
         self._said = ui.label().classes("sr-only").props("role=status")
         self._strip = ui.row().classes("w-full").props('role=region aria-label="Problems"')
+
+    def _acted(self, action: str) -> None:
+        _log.info("%s: page: %s", self._user, action)
+        self._live.wake()
 
     def _show_tab(self) -> None:
         if self._tabs.value == "applications":
