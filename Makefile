@@ -25,7 +25,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
-.PHONY: help setup environment check test lint format docs docs-links demo demo-migration demo-rollout bench evaluation fuzz clean
+.PHONY: help setup environment check test lint format docs docs-links screenshots demo demo-migration demo-rollout bench evaluation fuzz clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
@@ -83,6 +83,9 @@ bench: setup ## all benchmarks; each ends with one line of JSON
 
 fuzz: setup ## hostile input with random seeds for a while: make fuzz MINUTES=60
 	@$(BIN)/python scripts/fuzz.py --minutes "$(or $(MINUTES),60)"
+
+screenshots: setup ## the pictures of the page in the docs, taken while a demo runs (Chromium)
+	@$(BIN)/python scripts/screenshots.py
 
 evaluation: setup ## the paper's figures and table, on virtual hosts: out/evaluation/ (root, 40 minutes)
 	@$(BIN)/python -m benchmarks.paper all --out "$(or $(OUT),out/evaluation)"

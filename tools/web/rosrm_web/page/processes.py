@@ -29,7 +29,7 @@ _NAME: Final = """params => {
   cell.append(mark, params.value);
   return cell;
 }"""
-#: Sorts siblings only: the members of a group stay behind it.
+#: Sorts siblings only, groups first: the members of a group stay behind it.
 _SORT: Final = """params => {
   const below = new Map();
   for (const node of params.nodes) {
@@ -37,8 +37,10 @@ _SORT: Final = """params => {
     below.has(parent) ? below.get(parent).push(node) : below.set(parent, [node]);
   }
   params.nodes.length = 0;
+  const isProcess = node => Number(node.data.open === undefined);
   const add = parent => {
-    for (const node of below.get(parent) ?? []) {
+    const siblings = below.get(parent) ?? [];
+    for (const node of siblings.sort((a, b) => isProcess(a) - isProcess(b))) {
       params.nodes.push(node);
       add(node.data.id);
     }

@@ -47,9 +47,9 @@ def usage(name: str, title: str = "") -> dict[str, Any]:
 
 
 HOSTS: Final = (
-    column("host", width=150),
+    column("host", width=150, sort="asc"),
     STATE,
-    column("processes", width=110),
+    column("processes", width=130),
     usage("cpu", "CPU"),
     usage("memory"),
     usage("disk"),

@@ -1,0 +1,147 @@
+"""Take the pictures of the page for the docs, while a demo runs: `make screenshots`.
+
+The pictures are docs/pictures/page-*.png. Needs Chromium.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from playwright.sync_api import sync_playwright
+
+ROOT = Path(__file__).resolve().parent.parent
+PICTURES = ROOT / "docs" / "pictures"
+OUT = ROOT / "out" / "screenshots"
+#: Line of the demo with the address of its page.
+ADDRESS = re.compile(r"the page of this cluster, .*: (http\S+)")
+#: Line of the demo once the hosts are full and the queue waits.
+BUSY = re.compile(r"^ +\d+ s .* (?:[2-9]|\d\d) wait")
+#: Line of the demo about the move of a process off a full host.
+MOVED = re.compile(r" moves from ")
+#: Milliseconds for the page to show something.
+PATIENCE = 60_000
+
+
+class Picture(NamedTuple):
+    """A picture: what is done on the page before it is taken, and how the browser looks."""
+
+    name: str
+    prepare: Callable[[Any], None]
+    width: int = 1280
+    height: int = 800
+    scheme: str = "light"
+
+
+def main() -> int:
+    """Run a demo and take all pictures; return the exit status."""
+    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
+    if chromium is None:
+        print(
+            "screenshots: this machine has no Chromium: apt-get install chromium", file=sys.stderr
+        )
+        return 2
+    OUT.parent.mkdir(exist_ok=True)
+    demo = subprocess.Popen(
+        [sys.executable, "-m", "rosrm_examples.demo", "--out", str(OUT), "--pace", "0.5"],
+        stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, cwd=ROOT,
+    )  # fmt: skip
+    try:
+        url = wait_for(demo, ADDRESS)[1]
+        wait_for(demo, BUSY)
+        with sync_playwright() as driver:
+            # Its sandbox needs a user that is not root.
+            browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+            for one in PICTURES_OF_A_FULL_QUEUE:
+                take(browser, url, one)
+            wait_for(demo, MOVED)
+            take(browser, url, TIMELINE)
+            browser.close()
+    finally:
+        demo.terminate()
+        demo.communicate()
+    return 0
+
+
+def wait_for(demo: subprocess.Popen[str], what: re.Pattern[str]) -> re.Match[str]:
+    """Return the next line of the demo that matches; raises `RuntimeError` where it ends."""
+    assert demo.stdout is not None
+    for line in demo.stdout:
+        if found := what.search(line):
+            return found
+    raise RuntimeError(f"the demo ended with exit code {demo.wait()} before {what.pattern!r}")
+
+
+def take(browser: Any, url: str, picture: Picture) -> None:
+    """Open the page, prepare it, and write a picture."""
+    size = {"width": picture.width, "height": picture.height}
+    context = browser.new_context(viewport=size, color_scheme=picture.scheme)
+    context.set_default_timeout(PATIENCE)
+    page = context.new_page()
+    page.goto(url)
+    page.locator(".ag-row:visible").first.wait_for()
+    picture.prepare(page)
+    page.wait_for_load_state("networkidle")
+    path = PICTURES / f"page-{picture.name}.png"
+    page.screenshot(path=path, animations="disabled")
+    print(path.relative_to(ROOT), flush=True)
+    context.close()
+
+
+def open_tab(page: Any, name: str) -> None:
+    """Show a tab with a table."""
+    page.get_by_role("tab", name=name).click()
+    page.locator(".ag-row:visible").first.wait_for()
+
+
+def open_processes(page: Any) -> None:
+    """Show the processes as a tree."""
+    open_tab(page, "Processes")
+    page.get_by_role("button", name="Expand all").click()
+    page.locator(".ag-row:visible", has_text="piece_01").wait_for()
+
+
+def open_timeline(page: Any) -> None:
+    """Show the timeline."""
+    page.get_by_role("tab", name="Timeline").click()
+    page.get_by_role("button", name="1 min").click()
+    page.locator("svg text", has_text="host3").first.wait_for()
+    page.locator(".rosrm-marks .ag-row:visible").first.wait_for()
+
+
+def open_process(page: Any, name: str = "holder_20") -> None:
+    """Open the dialog of a process, by default of one that was assigned to busy hosts."""
+    open_tab(page, "Processes")
+    page.get_by_label("Search processes").fill(name)
+    page.locator(".ag-row:visible", has_text=name).first.dblclick()
+    page.get_by_role("dialog").get_by_role("cell", name="chosen").wait_for()
+
+
+def open_logs(page: Any) -> None:
+    """Open the log of a process; without the lines that have paths of this machine."""
+    open_process(page, "piece_01")
+    page.get_by_role("dialog").get_by_role("tab", name="Logs").click()
+    page.get_by_label("Show only lines with").fill(" of CPU")
+    page.get_by_role("dialog").get_by_text("s of CPU a scan").first.wait_for()
+    page.get_by_role("dialog").get_by_text("wrote").wait_for(state="detached")
+
+
+PICTURES_OF_A_FULL_QUEUE = (
+    Picture("hosts", lambda _: None, height=420),
+    Picture("processes", open_processes),
+    Picture("applications", lambda page: open_tab(page, "Applications"), height=420),
+    Picture("explain", open_process),
+    Picture("logs", open_logs),
+    Picture("events", lambda page: open_tab(page, "Events"), height=560, scheme="dark"),
+    Picture("phone", open_processes, width=390, height=700),
+)
+TIMELINE = Picture("timeline", open_timeline)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
