@@ -11,7 +11,7 @@ from rosrm.model.rows import ProcessRow
 from rosrm.model.values import MigrationPolicy, ProcessSpec, RestartPolicy
 from tests.faults.handoff_watcher import Fault, Watcher, answered_by, blocks, instances, is_gapless
 from tests.ros.clusters import QUICK, Cluster, host
-from tests.waiting import PATIENCE
+from tests.waiting import PATIENCE, wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
 NAME = "moving"
@@ -51,6 +51,7 @@ class Scene:
     def __init__(self, make, module: str = COUNT, *, inputs: float = 0.0, **options) -> None:
         self.cluster: Cluster = make(host("h0"), host("h1"), liveness=LivenessSettings())
         self.watcher = Watcher(self.cluster.domain, ("h0", "h1"), inputs)
+        wait_until(lambda: len(self.watcher.slaves()) == 2, "the watcher discovers the slaves")
         self._source = self._pid = 0
         self._host = ""
         self._begun = 0
@@ -131,7 +132,10 @@ class Scene:
         if victim == "master":
             self.cluster.restart_master()
         elif victim.endswith("slave"):
+            known = self.watcher.slaves()
             self.cluster.start_slave_again(self._host_of(victim))
+            # Otherwise the watcher may miss the first status of the next migration.
+            wait_until(lambda: self.watcher.slaves() - known, "the watcher discovers the slave")
 
     # --- faults ----------------------------------------------------------------------------
 

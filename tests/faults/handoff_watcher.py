@@ -114,6 +114,11 @@ class Watcher:
         self.destination_pid = 0
         self._source, self._faults = source, list(faults)
 
+    def slaves(self) -> set[bytes]:
+        """Return the publishers of process status that are discovered, one for each slave's run."""
+        found = self._node.get_publishers_info_by_topic(STATUS_TOPIC)
+        return {bytes(one.endpoint_gid) for one in found}
+
     def _drive(self) -> None:
         self._sent += 1
         self._inputs.publish(Int64(data=self._sent))
