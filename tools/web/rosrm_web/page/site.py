@@ -45,7 +45,10 @@ _STYLE: Final = """
 .rosrm-grid { height: calc(100vh - 13rem); min-height: 16rem; }
 .rosrm-tools ~ .rosrm-grid { height: calc(100vh - 17rem); }
 .nicegui-content .rosrm-half { height: calc(50vh - 9rem); margin-bottom: 0.5rem; }
-.rosrm-work { font-family: monospace; background: transparent; border: 1px solid; padding: 0.5rem; }
+.rosrm-work {
+  color: inherit; background: transparent; font-family: monospace; border: 1px solid;
+  padding: 0.5rem;
+}
 .rosrm-mark { display: inline-block; width: 1.2em; cursor: pointer; }
 .rosrm-bad { color: #b00020; font-weight: 700; }
 .rosrm-poor { color: #8a5a00; font-weight: 700; }
