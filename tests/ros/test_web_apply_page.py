@@ -14,6 +14,9 @@ from tests.ros.clusters import STEADY, Cluster, host
 from tests.ros.web_kit import gateway
 from tests.waiting import wait_until
 
+#: As in test_web_page.py.
+pytestmark = pytest.mark.timeout(600)
+
 TOKEN = "0123456789abcdef01234567"
 #: A name cannot have HTML, but a reason can.
 HTML = "<img src=x onerror=alert(1)>"

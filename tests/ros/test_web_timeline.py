@@ -12,6 +12,9 @@ from tests.ros.browser_kit import browser, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
+#: As in test_web_page.py.
+pytestmark = pytest.mark.timeout(600)
+
 MOVES = MigrationPolicy("relaunch")
 #: HTML in the reason of a failure and of a move: the name of a program that does not exist.
 HTML = "<img src=x onerror=alert(1)>"
