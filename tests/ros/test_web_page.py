@@ -172,6 +172,22 @@ def test_a_token_opens_the_page_and_an_operator_acts(chromium, cluster, tmp_path
         cordoned.wait_for(state="detached")
 
 
+def test_the_page_of_an_operator_who_becomes_a_viewer_is_replaced(chromium, cluster, tmp_path):
+    """The token stays valid, but the buttons of the open page must not act any more."""
+    tokens = tmp_path / "tokens"
+    tokens.write_text(f"operator ada {TOKEN}\noperator eve {TOKEN[::-1]}\n")
+    tokens.chmod(0o600)
+    with (
+        gateway(cluster.ros, "--tokens", str(tokens), "--allow-actions") as web,
+        tab(chromium, web.url) as page,
+    ):
+        page.get_by_label("Token").fill(TOKEN)
+        page.get_by_role("button", name="Log in").click()
+        page.get_by_text("operator", exact=True).wait_for()
+        tokens.write_text(f"viewer ada {TOKEN}\noperator eve {TOKEN[::-1]}\n")
+        page.get_by_text("read-only", exact=True).wait_for()
+
+
 def act(page: Any, action: str, warning: str) -> None:
     """Press the button of an action twice, and then that of the one question with this warning."""
     page.get_by_role("button", name=action, exact=True).evaluate("it => { it.click(); it.click() }")

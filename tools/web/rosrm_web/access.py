@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from rosrm.errors import ConfigError
 from rosrm_web.tokens import User, read_tokens
@@ -19,7 +19,7 @@ _log = logging.getLogger("rosrm.web")
 
 
 class Access:
-    """The users, and the requests that each of them has open.
+    """The users, and the requests and pages that each of them has open.
 
     Args:
         users: users at the start.
@@ -35,7 +35,7 @@ class Access:
         self.trouble = ""
         self._path = path
         self._seen = _state(path)
-        self._open: set[tuple[User, asyncio.Task[Any]]] = set()
+        self._open: dict[object, tuple[User, Callable[[], object]]] = {}
 
     async def follow_file(self) -> None:
         """Look at the file regularly, until the task is cancelled."""
@@ -44,7 +44,9 @@ class Access:
             self.look(self._path)
 
     def look(self, path: Path) -> None:
-        """Read the file again if it has changed, and end the requests of users that left it.
+        """Read the file again if it has changed; end the requests and pages of users that left it.
+
+        A user with another role or token is another user.
 
         An invalid file changes nothing.
         """
@@ -60,20 +62,30 @@ class Access:
             return
         self.trouble = ""
         _log.info("tokens: read again: %d users", len(self.users))
-        for user, request in self._open:
+        for user, end in list(self._open.values()):
             if user not in self.users:
-                request.cancel()
+                end()
 
     @contextmanager
     def open_request(self, user: User) -> Iterator[None]:
         """Let `look` cancel the present task when the user's token is revoked."""
         task = asyncio.current_task()
         assert task is not None
-        self._open.add((user, task))
+        close = self.open(user, task.cancel)
         try:
             yield
         finally:
-            self._open.discard((user, task))
+            close()
+
+    def open(self, user: User, end: Callable[[], object]) -> Callable[[], None]:
+        """Let `look` call a function for a revoked token; the returned function ends that."""
+        key = object()
+        self._open[key] = user, end
+
+        def close() -> None:
+            del self._open[key]
+
+        return close
 
 
 def _state(path: Path | None) -> tuple[int, ...]:

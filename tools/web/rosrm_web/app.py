@@ -91,7 +91,7 @@ def create_app(gateway: Gateway, settings: Settings, access: Access) -> FastAPI:
     app.add_api_route(LOGIN, login.show, methods=["GET"], include_in_schema=False)
     app.add_api_route(LOGIN, login.enter, methods=["POST"], include_in_schema=False)
     app.add_api_route("/v1/{path:path}", _unknown_path, include_in_schema=False)
-    mount(app, gateway)  # takes all other paths
+    mount(app, gateway, access)  # takes all other paths
     return app
 
 

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from nicegui.events import ValueChangeEventArguments
     from starlette.types import ASGIApp
 
+    from rosrm_web.access import Access
     from rosrm_web.gateway import Gateway
 
 #: Highest number of pages at the same time.
@@ -63,13 +64,13 @@ _STYLE: Final = """
 _log = logging.getLogger("rosrm.web")
 
 
-def mount(app: FastAPI, gateway: Gateway) -> None:
+def mount(app: FastAPI, gateway: Gateway, access: Access) -> None:
     """Add the page to the application of the gateway, at `/`."""
     live, feed = Live(gateway), Feed(gateway)
     nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
     room = [Depends(partial(_check_room, live))]
     page = ui.page("/", title="rosrm", dark=None, reconnect_timeout=_ABSENCE, dependencies=room)
-    page(partial(_page, gateway, live, feed))
+    page(partial(_page, gateway, access, live, feed))
     ui.run_with(
         app, show_welcome_message=False, language="en-US", reconnect_timeout=_PINGS,
         gzip_middleware_factory=_quickly,
@@ -90,12 +91,14 @@ async def _check_room(live: Live) -> None:
         raise Busy(f"{MOST_PAGES} pages are open already; close one, or try again later")
 
 
-def _page(gateway: Gateway, live: Live, feed: Feed) -> None:
+def _page(gateway: Gateway, access: Access, live: Live, feed: Feed) -> None:
     client = ui.context.client
     request = client.request
     user, may_act = request.scope["user"], bool(request.scope["may_act"])
     page = Page(gateway, live, feed, user=user.name, may_act=may_act)
     client.on_delete(page.leave)
+    # A browser would come back to its page with the former rights.
+    client.on_delete(access.open(user, client.delete))
     live.join(page.update)
     page.update()
 
