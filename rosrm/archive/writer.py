@@ -94,13 +94,14 @@ class ArchiveWriter:
         if not part.content:
             return
         segment = self._open_at(source, part.offset)
+        before = segment.room
         try:
             _add_marks(segment, part)
             _append(segment.path, part.content)
         finally:
             self._refresh(source, segment)
         segment = self._segments[source][-1]
-        self._unchecked += len(part.content)
+        self._unchecked += segment.room - before
         if max(segment.end - segment.begin, log_index.size(str(segment.path))) >= SEGMENT_BYTES:
             self.close(source)
 

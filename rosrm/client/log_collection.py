@@ -163,7 +163,8 @@ class LogCollector:
 
     def _settle(self, host: str, process: str, refusal: Refused) -> None:
         """Ask for a log that a slave or the master refuses only after another event."""
-        self._logs[host, process].due = _NEVER
+        log = self._logs[host, process]
+        log.due, log.numbers = _NEVER, ()
         if refusal.code != "unknown":
             self._say(f"{process} on {host}", f"the log of {process} on {host}: {refusal}")
 
@@ -185,6 +186,7 @@ class LogCollector:
                 stored += self._store_new(master, Source(host, process, number), log)
         newest = _newest(log.numbers)
         log.complete.intersection_update(newest)
+        log.compared.intersection_update(newest)
         log.wait = (
             min(2 * log.wait, self._every * _QUIET) if log.wait and not stored else self._every
         )

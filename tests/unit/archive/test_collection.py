@@ -20,8 +20,9 @@ from rosrm.archive import writer
 from rosrm.archive.reader import LogArchive
 from rosrm.archive.retention import ArchiveLimits
 from rosrm.client import log_collection
+from rosrm.errors import Refused
 from rosrm.model.rows import LogPart
-from tests.unit.archive.rig import HOST, PROCESS, Rig
+from tests.unit.archive.rig import HOST, PROCESS, Master, Rig
 from tests.unit.cli.conftest import host, process
 
 
@@ -208,6 +209,23 @@ def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig, monkeypa
     assert rig.chunks() == [(0, b"one\n")]
 
 
+def test_a_log_that_is_removed_while_it_is_collected_holds_up_no_newer_one(rig, monkeypatch):
+    """The slave removed the log of an instance after it had named it."""
+    rig.alpha.write(b"old", 1)
+    rig.alpha.write(b"new", 2)
+    rig.master.processes = [process(PROCESS, host=HOST, number=2)]
+
+    def read_log(host, name, number=0, *rest):
+        if number == 1 and rig.alpha.path(1).exists():
+            rig.alpha.path(1).unlink()
+            raise Refused("no log", "unknown")
+        return Master.read_log(rig.master, host, name, number, *rest)
+
+    monkeypatch.setattr(rig.master, "read_log", read_log)
+    rig.collect(looks=2)
+    assert rig.chunks(2) == [(0, b"new")]
+
+
 def test_a_full_disk_loses_and_doubles_nothing(rig, monkeypatch):
     """A part of the bytes was written before the disk was full."""
     rig.alpha.write(b"one\ntwo\n")
@@ -265,6 +283,18 @@ def test_the_oldest_output_is_removed_first_and_never_collected_again(tmp_path, 
     kept = [number for number in range(1, 9) if rig.chunks(number)]
     assert kept == [4, 5, 6, 7, 8]
     assert sum(path.stat().st_size for path in rig.directory.glob("hosts/alpha/nav.1.*")) == 0
+
+
+def test_many_small_logs_count_with_their_room_on_the_disk(tmp_path):
+    """Each file takes at least a block, although its output has a few bytes."""
+    rig = Rig(tmp_path, ArchiveLimits(1_000_000, 1_000_000))
+    for number in range(1, 201):
+        rig.alpha.write(b"done\n", number)
+        rig.alpha.ended.add((PROCESS, number))
+        rig.master.note(host=HOST)
+        rig.collect()
+    blocks = [-(-path.stat().st_size // 4096) for path in rig.directory.glob("hosts/*/*")]
+    assert sum(blocks) * 4096 < 1_050_000
 
 
 def test_open_logs_are_closed_where_they_alone_exceed_a_bound(tmp_path):
