@@ -55,11 +55,6 @@ class LogArchive:
 
     def __init__(self, directory: Path) -> None:
         self.directory = directory
-        if not (directory / "hosts").is_dir():
-            raise Refused(
-                f"{directory} is no log archive: `rosrm collect-logs {directory}` makes one",
-                "unknown",
-            )
         self._loaded: tuple[Path, _Content] | None = None
         self._read_directory()
 
@@ -98,10 +93,16 @@ class LogArchive:
     # --- segments ------------------------------------------------------------------------
 
     def _read_directory(self) -> None:
+        directory = self.directory
         try:
-            self._segments = read_segments(self.directory)
+            if not (directory / "hosts").is_dir():
+                raise Refused(
+                    f"{directory} is no log archive: `rosrm collect-logs {directory}` makes one",
+                    "unknown",
+                )
+            self._segments = read_segments(directory)
         except OSError as error:
-            raise Refused(f"{self.directory} cannot be read: {error.strerror}") from None
+            raise Refused(f"{directory} cannot be read: {error.strerror}") from None
 
     def _sources(self, process: str) -> list[Source]:
         return [

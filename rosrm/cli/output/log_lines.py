@@ -109,7 +109,8 @@ class LogStream:
         """Add a line of rosrm; `when` orders it among the lines of other processes."""
         self.close()
         self._context.begin_program()
-        if self.search is not None and self.search.is_selective:
+        search = self.search
+        if search is not None and (search.is_selective or 0.0 < search.until < when):
             return
         if not self._at_line_start:
             self._add(b"\n")

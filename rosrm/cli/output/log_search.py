@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import warnings
 from dataclasses import dataclass
 from typing import Final
 
@@ -42,7 +43,9 @@ class LineSearch:
 def pattern_of(option: str, text: str) -> re.Pattern[str]:
     """Return the regular expression of an option; raises `ConfigError`."""
     try:
-        return re.compile(text)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a set that later versions of Python may read anew
+            return re.compile(text)
     except (re.error, RecursionError, OverflowError) as error:
         raise ConfigError(
             f"{option} {text}: this is no regular expression: {error}. A backslash before a "

@@ -82,6 +82,12 @@ def test_a_directory_that_is_no_archive_is_refused(rosrm, rig, tmp_path):
     assert (result.code, "is no log archive" in result.err) == (1, True)
 
 
+def test_a_directory_that_cannot_be_looked_into_is_refused(rosrm, rig):
+    """For example that of another user."""
+    result = rosrm("logs", PROCESS, "--archive", "a" * 300)
+    assert (result.code, "cannot be read: File name too long" in result.err) == (1, True)
+
+
 def test_a_damaged_file_is_named(rosrm, rig):
     rig.alpha.ended.add((PROCESS, 1))
     rig.start()

@@ -101,6 +101,20 @@ def test_until_leaves_out_later_lines():
     assert [line[-2:] for _, line in found] == [b"a\n"]
 
 
+def test_until_leaves_out_later_starts():
+    stream = LogStream("nav", search=LineSearch(until=NOON))
+    stream.write(LogChunk("nav", "alpha", 3, b"a\n", 0, 0, True, [(NOON - 1.0, 2, 0)]))
+    late = [(NOON + 1.0, 0, 77), (NOON + 1.0, 2, 0)]
+    stream.write(LogChunk("nav", "alpha", 4, b"b\n", 0, 0, True, late))
+    assert [line for _, line in stream.take()] == [b"a\n"]
+
+
+def test_an_ambiguous_expression_is_taken_without_a_warning(recwarn):
+    """Python would print one, with a path of its own."""
+    assert pattern_of("--grep", "[[nav]").search("[nav]: text")
+    assert not recwarn.list
+
+
 def test_a_line_is_an_object_of_json():
     """Invalid bytes and control characters cannot break the form."""
     text = b"[WARN] [1700000000.2] [nav]: \xff\x1b[2J\r\nrest"
