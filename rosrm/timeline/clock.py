@@ -40,3 +40,8 @@ class EventClock:
         """Return seconds as unix time, by the clock of the newest event; 0: there is no event."""
         before = self._before
         return 0.0 if before is None else before.wall_time + seconds - self.newest
+
+    def seconds(self, wall_time: float) -> float:
+        """Return unix time as seconds, the inverse of `wall_time`; 0: there is no event."""
+        before = self._before
+        return 0.0 if before is None else self.newest + wall_time - before.wall_time

@@ -30,3 +30,4 @@ def test_the_present_time_follows_the_master():
 
     assert clock.at(3.0) == clock.newest + 2.0
     assert clock.wall_time(clock.newest + 2.0) == 1.7e9 + 62
+    assert clock.seconds(1.7e9 + 62) == clock.newest + 2.0

@@ -141,10 +141,19 @@ def test_names_narrow_the_picture():
 def test_a_look_back_shows_what_was_then():
     """Runs that began later are missing, and runs that have not ended are there."""
     lines = (*RUNS, (100, "assigned", "q", "b"))
-    made = drawn(*lines, processes=[process("p"), process("q")], now=200.0, end=70.0)
+    made = drawn(*lines, processes=[process("p"), process("q")], now=200.0, end=BEGAN + 70.0)
 
     assert [bar[4] for bar in made.bars] == ["p"]
-    assert drawn(*lines, now=200.0, end=9.0).bars == []
+    assert drawn(*lines, now=200.0, end=BEGAN + 9.0).bars == []
+
+
+def test_a_look_back_stays_at_its_time_when_old_events_are_forgotten():
+    """Seconds of the timeline count from its first event, which is another one then."""
+    lines = (*RUNS, (100, "assigned", "q", "b"))
+
+    for known, now in ((lines, 200.0), (lines[1:], 190.0)):
+        made = drawn(*known, now=now, end=BEGAN + 95.0)
+        assert [(bar[0], bar[4]) for bar in made.bars] == [(ms(10), "p")]
 
 
 def test_a_bar_keeps_its_row_when_another_one_leaves_the_view():

@@ -40,7 +40,7 @@ class View:
 
     Attributes:
         seconds: length.
-        end: seconds of the timeline; None: now.
+        end: unix time, which stays the same when old events are forgotten; None: now.
         host, application, process: parts of the names that are shown; "": all.
     """
 
@@ -89,7 +89,7 @@ def picture(timeline: Timeline, listing: Listing, view: View, now: float) -> Pic
 class _Drawing:
     def __init__(self, timeline: Timeline, listing: Listing, view: View, now: float) -> None:
         self._timeline, self._listing, self._view, self._now = timeline, listing, view, now
-        self._end = now if view.end is None else view.end
+        self._end = now if view.end is None else timeline.clock.seconds(view.end)
         self._begin = self._end - view.seconds
         self._processes = {row.name: row for row in listing.processes}
         self._found = timeline.processes.histories(math.inf)

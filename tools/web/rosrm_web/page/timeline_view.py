@@ -111,7 +111,9 @@ class Timeline:
 
     def _shift(self, share: float) -> None:
         end = self._end + share * self._view.seconds
-        self._look(replace(self._view, end=end if end < self._now() else None))
+        is_past = self._drawn and end < self._now()
+        wall_time = self._feed.timeline.clock.wall_time(end)
+        self._look(replace(self._view, end=wall_time if is_past else None))
 
     def _follow(self) -> None:
         self._look(replace(self._view, end=None))
@@ -124,8 +126,9 @@ class Timeline:
     def _zoomed(self, event: GenericEventArguments) -> None:
         """Stop following when the visible part no longer ends now."""
         _, end = event.args
-        if end < 99.0 and self._view.end is None:
-            self._view = replace(self._view, end=self._now())
+        if end < 99.0 and self._view.end is None and self._drawn:
+            wall_time = self._feed.timeline.clock.wall_time(self._now())
+            self._view = replace(self._view, end=wall_time)
             self._show_state()
 
     def _look(self, view: View) -> None:
@@ -162,7 +165,8 @@ class Timeline:
 
     @property
     def _end(self) -> float:
-        return self._now() if self._view.end is None else self._view.end
+        end = self._view.end
+        return self._now() if end is None else self._feed.timeline.clock.seconds(end)
 
     def _draw(self) -> None:
         """Send the picture if it has changed; otherwise only the time of its edges."""
