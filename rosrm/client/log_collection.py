@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 #: Bytes of one request, and of one log before the next log has its turn.
 PART: Final = 256 * 1024
 TURN: Final = 4 * PART
+#: Parts of one log before the next log has its turn, if the slave sends small ones.
+_PARTS: Final = 16
 #: Longest time (s) until a quiet log is asked for again, as a multiple of `every`.
 _QUIET: Final = 15
 #: Bytes that are compared where reading continues.
@@ -195,9 +197,11 @@ class LogCollector:
         log.due = _NEVER if is_complete else time.monotonic() + wait
 
     def _store_new(self, master: MasterClient, source: Source, log: _Log) -> int:
-        """Store new output of an instance, at most `TURN` bytes; return their number."""
+        """Store new output of an instance, at most about `TURN` bytes; return their number."""
         archive, stored = self._archive, 0
-        while stored < TURN and not self._stop.is_set():
+        for _ in range(_PARTS):
+            if stored >= TURN or self._stop.is_set():
+                break
             position = archive.position(source)
             part = self._read(master, source, position, PART)
             end = min(part.offset, position)  # of the bytes that archive and host can both have

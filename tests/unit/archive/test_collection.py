@@ -209,6 +209,20 @@ def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig, monkeypa
     assert rig.chunks() == [(0, b"one\n")]
 
 
+def test_a_host_that_sends_a_byte_at_a_time_holds_up_no_other_log(rig, monkeypatch):
+    """After a few requests another log has its turn; the rest is collected later."""
+    rig.alpha.write(b"x" * 100)
+
+    def read_log(host, name, number=0, offset=0, _=0):
+        return Master.read_log(rig.master, host, name, number, offset, 1)
+
+    monkeypatch.setattr(rig.master, "read_log", read_log)
+    rig.collect()
+    assert len(rig.master.asked) < 50
+    rig.collect(looks=20)
+    assert rig.chunks(most=100) == [(0, b"x" * 100)]
+
+
 def test_a_log_that_is_removed_while_it_is_collected_holds_up_no_newer_one(rig, monkeypatch):
     """The slave removed the log of an instance after it had named it."""
     rig.alpha.write(b"old", 1)
