@@ -54,9 +54,13 @@ class ArchiveWriter:
         make_private_directory(directory)
         make_private_directory(directory / "hosts")
         self._directory, self._limits = directory, limits
-        self._segments = read_segments(directory)
-        self._unchecked = limits.keep
+        self.read_again()
         self._remove_remains()
+
+    def read_again(self) -> None:
+        """Read what the archive has, e.g. after somebody removed files; raises `OSError`."""
+        self._segments = read_segments(self._directory)
+        self._unchecked = self._limits.keep
 
     def position(self, source: Source) -> int:
         """Return the offset of the next byte of a source."""

@@ -93,6 +93,14 @@ class LogCollector:
             OSError: the archive cannot be written. The next call continues where it stopped.
         """
         self._take(self._list(master))
+        try:
+            self._collect_due(master)
+            self._archive.apply_limits()
+        except FileNotFoundError:  # somebody removed files
+            self._archive.read_again()
+            raise
+
+    def _collect_due(self, master: MasterClient) -> None:
         for host, process in self._due():
             if self._stop.is_set():
                 break
@@ -112,7 +120,6 @@ class LogCollector:
                 self._settle(host, process, Refused("its name is too long for a file", "invalid"))
             else:
                 self._said.pop(host, None)
-        self._archive.apply_limits()
 
     # --- which logs ----------------------------------------------------------------------
 

@@ -258,6 +258,19 @@ def test_a_full_disk_loses_and_doubles_nothing(rig, monkeypatch):
     assert rig.chunks() == [(0, b"one\ntwo\n")]
 
 
+def test_a_file_that_somebody_removes_is_collected_again(rig):
+    """The look fails once; the host still has the bytes."""
+    rig.alpha.write(b"one\n")
+    rig.collect()
+    (file,) = rig.directory.glob("hosts/*/*.log")
+    file.unlink()
+    rig.alpha.write(b"two\n")
+    with pytest.raises(FileNotFoundError):
+        rig.collect()
+    rig.collect()
+    assert rig.chunks() == [(0, b"one\ntwo\n")]
+
+
 def test_a_quiet_log_is_asked_for_less_and_less_often(rig, monkeypatch):
     """An event about the process ends the wait."""
     now = [0.0]
