@@ -58,6 +58,7 @@ class Watcher:
         load: figures of the master, as `Client.master_load` returns them.
         on_master: called with each new state of the master.
         on_events: called with new events, the oldest first.
+        on_new_journal: called when the sequences of events have begun again, before new events.
     """
 
     def __init__(self, link: MasterLink) -> None:
@@ -67,6 +68,7 @@ class Watcher:
         self.load: Mapping[str, float] = {}
         self.on_master: list[Callable[[MasterState], None]] = []
         self.on_events: list[Callable[[Sequence[EventRow]], None]] = []
+        self.on_new_journal: list[Callable[[], None]] = []
 
     async def run(self) -> None:
         """Ask until the task is cancelled."""
@@ -84,6 +86,9 @@ class Watcher:
             self._set_master(MasterState(state, str(error)))
             raise
         self._set_master(MasterState("up", ""))
+        if listing.last_sequence < self._after:
+            for forget in self.on_new_journal:
+                forget()
         self._after = listing.last_sequence
         for call in self.on_events if listing.events else ():
             call(listing.events)

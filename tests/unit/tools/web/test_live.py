@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 
-from rosrm.model.rows import Listing
+from rosrm.model.rows import EventRow, Listing
 from rosrm_web.gateway import Gateway
 from rosrm_web.page.live import Live
 
@@ -12,8 +12,11 @@ from rosrm_web.page.live import Live
 class Master:
     """A client of a master that is always there."""
 
+    newest = 1
+
     def list(self, **_):
-        return Listing("m", 1.0, 1)
+        event = EventRow(self.newest, 1.7e9, 1.0, "assigned", "p", "a", "")
+        return Listing("m", 1.0, self.newest, events=[event])
 
     def master_load(self):
         """Return nothing: no load was published."""
@@ -66,6 +69,29 @@ def test_nothing_is_read_while_nobody_looks():
         live.leave(live.on_change[0])
         _, still_reading = await asyncio.wait(reading, timeout=30.0)
         assert not still_reading
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_the_events_of_a_former_journal_are_dropped():
+    """Their higher sequences would hide the new events."""
+
+    async def scene() -> None:
+        master = Master()
+        master.newest = 7
+        gateway, live = await started(master)
+        changed = asyncio.Event()
+        live.join(changed.set)
+        await asyncio.wait_for(changed.wait(), 30.0)
+        assert live.events[-1].sequence == 7
+
+        master.newest = 1
+        await gateway.watcher.look()
+        changed.clear()
+        await asyncio.wait_for(changed.wait(), 30.0)
+        assert [one.sequence for one in live.events] == [1]
+        live.leave(changed.set)
         gateway.close()
 
     asyncio.run(scene())

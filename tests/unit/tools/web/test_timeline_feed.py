@@ -22,7 +22,8 @@ class Master:
 
     def list(self, *, events: bool = False, after: int = 0, **_) -> Listing:
         self.reads += events
-        return Listing("m", 1.0, 2, events=[one for one in self.rows if one.sequence > after])
+        last = self.rows[-1].sequence
+        return Listing("m", 1.0, last, events=[one for one in self.rows if one.sequence > after])
 
     def master_load(self):
         """Return nothing: no load was published."""
@@ -72,6 +73,28 @@ def test_a_burst_that_may_have_a_gap_is_read_again():
         master.rows.append(row(3000, "q"))
         await feed.read()
         assert (placements(feed), feed.newest, master.reads) == (["p", "q"], 3000, 2)
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_events_of_a_new_journal_replace_those_of_the_former():
+    """Another master has no journal of the former, so its sequences begin again."""
+
+    async def scene() -> None:
+        master = Master()
+        gateway = Gateway(lambda _: master)
+        await gateway.watcher.look()
+        feed = Feed(gateway)
+        await feed.read()
+        master.rows = [row(1, "new")]
+        await gateway.watcher.look()
+        assert (placements(feed), feed.newest) == ([], 0)
+        await feed.read()
+        assert (placements(feed), feed.newest) == (["new"], 1)
+        master.rows.append(row(2, "newer"))
+        await gateway.watcher.look()
+        assert (placements(feed), feed.newest) == (["new", "newer"], 2)
         gateway.close()
 
     asyncio.run(scene())

@@ -47,6 +47,7 @@ class Live:
         self.on_change: list[Callable[[], None]] = []
         self._task: asyncio.Task[None] | None = None
         gateway.watcher.on_events.append(self._take_events)
+        gateway.watcher.on_new_journal.append(self.events.clear)
         gateway.watcher.on_master.append(lambda _: self._woken.set())
 
     def join(self, on_change: Callable[[], None]) -> None:

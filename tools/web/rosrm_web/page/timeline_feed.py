@@ -41,6 +41,7 @@ class Feed:
         self.timeline = Timeline()
         self.newest = 0
         gateway.watcher.on_events.append(self.take)
+        gateway.watcher.on_new_journal.append(self._forget)
 
     async def read(self) -> None:
         """Read the newest events of the master, unless they are known."""
@@ -66,6 +67,12 @@ class Feed:
                 self._add(self._events[-1])
         if self._taken >= 2 * MOST_KEPT:
             self._begin_again()
+
+    def _forget(self) -> None:
+        """Drop all events; the next `read` has those of the new journal."""
+        self._is_whole, self.newest = False, 0
+        self._events.clear()
+        self._begin_again()
 
     def _begin_again(self) -> None:
         """Read the kept events into a new timeline, which does not have the older ones."""
