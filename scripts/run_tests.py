@@ -163,7 +163,7 @@ def run_pytest(
     result = RESULTS / f"{name}.xml"
     result.unlink(missing_ok=True)
     command = [
-        # A run with its output in a file runs beside tests in real time: those come first.
+        # Tests in real time run beside a run with its output in a file, which gets less priority.
         *(("nice", "-n", "5") if output else ()),
         *(sys.executable, "-m", "pytest", f"--junit-xml={result}", "-o", "junit_logging=all"),
         # Each run has its own list of failed tests: two runs that end at once would lose one.

@@ -1,6 +1,6 @@
-"""rosrm, Ray, Dask and a bare loop with the same work on this machine, by turns.
+"""rosrm, Ray, Dask and a bare loop with the same work on this machine, in turn.
 
-In each round every one of them runs, in an environment of its own: `date`, which prints the time as
+In each round each system runs, in an environment of its own: `date`, which prints the time as
 its first action, one after the other; 300 times `true` at once; 150 times `sleep 0.1` on three
 slots; 60 processes of 40 MB at once. Ray and Dask are installed into out/peers/ on the first run.
 They keep their state in memory; rosrm writes each job to its journal before it starts.
@@ -24,7 +24,7 @@ from benchmarks.stopping import run
 from rosrm.errors import RosrmError
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-#: Seconds for one measurement, with the start and the end of what is measured.
+#: Seconds for one measurement, with the start and the end of the measured system.
 _LONGEST: Final = 600.0
 #: Processes of each measurement, as named in the docs.
 _COUNTS: Final = {"stamps": 100, "jobs": 300, "sleeps": 150, "holders": 60}
@@ -32,7 +32,7 @@ _COUNTS: Final = {"stamps": 100, "jobs": 300, "sleeps": 150, "holders": 60}
 
 @dataclass(frozen=True)
 class Peer:
-    """One of those that are compared.
+    """A system in the comparison.
 
     Attributes:
         name: as in the result.
@@ -85,7 +85,7 @@ def measured(peer: Peer, measurement: str, count: int) -> Any:
     """Run one measurement in a process of its own; return its result.
 
     Raises:
-        RosrmError: it failed.
+        RosrmError: the measurement failed.
     """
     module = f"benchmarks.peers.run_{peer.name}"
     command = [peer.python, "-m", module, measurement, "--count", str(count)]
@@ -122,7 +122,7 @@ def installed(name: str, distribution: str, environments: Path) -> Peer:
 
 
 def _version(python: Path, distribution: str) -> str:
-    """Return the version of a distribution in an environment; "": it is not there."""
+    """Return the version of a distribution in an environment; "": it is not installed."""
     program = f"import importlib.metadata as m; print(m.version({distribution!r}))"
     ended = subprocess.run(
         [python, "-c", program], stdin=subprocess.DEVNULL, capture_output=True, text=True,

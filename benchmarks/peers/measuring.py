@@ -1,4 +1,4 @@
-"""Measurements of the comparison on anything that runs functions: the standard library alone.
+"""Measurements of the comparison, for any executor of functions; needs only the standard library.
 
 A runner is a program of an environment of its own. Its arguments name one measurement, and the last
 line of its output is the JSON of the result.
@@ -19,7 +19,7 @@ from benchmarks.peers import work
 
 #: Slots for `sleeps`, hosts or workers for everything else.
 SLOTS = 3
-#: What runs before a measurement, so that all workers are warm.
+#: Calls before a measurement, so that all worker processes have started.
 _WARM_UP = 30
 _LONGEST_S = 300.0
 

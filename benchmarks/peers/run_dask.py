@@ -13,7 +13,7 @@ distributed: Any = importlib.import_module("distributed")
 
 
 class Tasks:
-    """Tasks that are never taken for one another."""
+    """Tasks whose results Dask does not reuse for another task."""
 
     def __init__(self, client: Any) -> None:
         self._client = client

@@ -49,13 +49,13 @@ myst_fence_as_directive = ["mermaid"]
 # A link that leads nowhere is an error, and so is a private type in the interface of a public name.
 nitpicky = True
 nitpick_ignore_regex = [
-    ("py:.*", r"(?!rosrm\.).*"),  # without a network, types of others have no pages
+    ("py:.*", r"(?!rosrm\.).*"),  # without a network, types of other packages have no pages
     # Parts of a spec that programs give as a mapping or read, but do not import.
     ("py:class", r"rosrm\.model\.(values|adoption|codec|records)\..*"),
-    # What the contracts of `rosrm.testing` have inside.
+    # Internal types of the contracts of `rosrm.testing`.
     ("py:class", r"rosrm\.extensions\..*"),
 ]
-linkcheck_anchors = False  # the pages of Git hosts make theirs by script
+linkcheck_anchors = False  # Git hosts add anchors to a page by script
 linkcheck_timeout = 20
 
 # --- reference from docstrings ----------------------------------------------------------------

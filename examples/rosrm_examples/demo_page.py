@@ -14,7 +14,7 @@ from rosrm import RosSettings
 
 _ADDRESS: Final = "127.0.0.1"
 _USUAL_PORT: Final = 8290
-#: Begin of the line with which the gateway says its address.
+#: Beginning of the line in which the gateway prints its address.
 _READY: Final = "rosrm web: "
 _END_S: Final = 10.0
 
@@ -30,29 +30,29 @@ class DemoPage:
             log: file for its errors.
         """
         self._log = log
-        self._told = False
+        self._announced = False
         with log.open("wb") as sink:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "rosrm.cli", "web", "--listen", f"{_ADDRESS}:{_port()}"],
                 env={**os.environ, **ros.environment(), "PYTHONUNBUFFERED": "1"},
                 stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=sink, text=True,
-                start_new_session=True,  # a Ctrl-C is for the demo, which ends it
+                start_new_session=True,  # Ctrl-C must reach only the demo, which ends the gateway
             )  # fmt: skip
         assert self._process.stdout is not None
         os.set_blocking(self._process.stdout.fileno(), False)
 
     def news(self) -> str:
-        """Return once a sentence with the address of the page, or on its failure; else ""."""
-        if self._told:
+        """Return a sentence with the address or the failure of the page, once; otherwise ""."""
+        if self._announced:
             return ""
         assert self._process.stdout is not None
         ended = self._process.poll() is not None
         line = self._process.stdout.readline()
         if line.startswith(_READY):
-            self._told = True
+            self._announced = True
             return f"the page of this cluster, until the demo ends: {_url(line)}"
         if ended:
-            self._told = True
+            self._announced = True
             return f"without a page: `rosrm web` ended; see {self._log}"
         return ""
 

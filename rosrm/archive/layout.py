@@ -31,7 +31,7 @@ _BLOCK: Final = 4096
 
 
 class Source(NamedTuple):
-    """An instance of a process on a host: what a log in the archive comes from."""
+    """An instance of a process on a host, whose log is in the archive."""
 
     host: str
     process: str
@@ -82,7 +82,7 @@ def host_folder(directory: Path, host: str) -> Path:
 
 
 def is_own_name(name: str) -> bool:
-    """Return True if a file of this name belongs to a segment, or is a remain of one."""
+    """Return True if a file of this name belongs to a segment, or is left over from one."""
     return _OWN_NAME.fullmatch(name) is not None
 
 
@@ -117,8 +117,8 @@ def segment_at(path: Path) -> tuple[Source, Segment] | None:
 def read_segments(directory: Path) -> Segments:
     """Return the segments of each source in their order.
 
-    Of a closed and an open segment that begin at the same offset the closed one counts: a crash
-    can leave both, and the closed one is complete.
+    If a closed and an open segment begin at the same offset, return the closed one: a crash can
+    leave both, and the closed one is complete.
 
     Raises:
         OSError: the directory cannot be read.

@@ -1,7 +1,8 @@
 """Writer of a log archive: appends, compresses and removes.
 
-Bytes are appended only at the end of what a source has, and that end is read from the file. So a
-crash at any moment loses no byte and stores none twice: what was not written is requested again.
+Bytes are appended only at the end of the stored log of a source, and that end is read from the
+file. So a crash at any moment loses no byte and stores none twice: the collector requests bytes
+again that were not written.
 """
 
 from __future__ import annotations

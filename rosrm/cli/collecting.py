@@ -69,7 +69,7 @@ def collect(
 
 
 class Collecting:
-    """Runs a collector while master and disk come and go.
+    """Runs a collector; continues after a failure of the master or the disk.
 
     Args:
         collector: stores logs.
@@ -97,7 +97,7 @@ class Collecting:
             self._master.close()
 
     def _look(self, every: float) -> float:
-        """Store what is new; return the seconds until the next look."""
+        """Store new output; return the seconds until the next look."""
         try:
             if self._master is None:
                 self._master = self._connect()
@@ -114,12 +114,12 @@ class Collecting:
             return _AGAIN
         else:
             if self._trouble:
-                _say("collecting again")
+                _say(f"collecting logs into {self._directory} again")
             self._trouble = ""
         return every
 
     def _note(self, trouble: str) -> None:
-        """Report a trouble once, until it has ended."""
+        """Print the first failure since the last success."""
         if not self._trouble:
             _say(trouble)
         self._trouble = trouble

@@ -1,7 +1,7 @@
 """Collection of logs: requests the output of all processes from the slaves, into an archive.
 
-The collector asks a slave for the bytes behind those that the archive has. It asks for a log with
-new output again after `every`, and for a quiet one less and less often.
+The collector requests the bytes after those that the archive has. It requests a log with new output
+again after `every`, and a quiet log at longer and longer intervals.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ TURN: Final = 4 * PART
 _PARTS: Final = 16
 #: Longest time (s) until a quiet log is asked for again, as a multiple of `every`.
 _QUIET: Final = 15
-#: Bytes that are compared where reading continues.
+#: Stored bytes that are compared with those of the host before reading continues.
 _OVERLAP: Final = 64
 _EVENTS: Final = 10_000
 #: Newest instances of a process on one host that are collected; a slave keeps 5 by default.
@@ -111,7 +111,7 @@ class LogCollector:
             except NoMaster as error:
                 self._silent[host] = time.monotonic() + _SILENT
                 self._say(host, str(error))
-                self._take(self._list(master))  # raises if the master is the silent one
+                self._take(self._list(master))  # raises if the master does not answer
             except Refused as refusal:
                 self._settle(host, process, refusal)
             except OSError as error:

@@ -46,7 +46,7 @@ class HostMetrics:
 
 
 class Textfile:
-    """The file of a host, which is written now and then.
+    """The file of a host, written every `PERIOD`.
 
     Args:
         directory: of the collector; `Path()`: no file is written.
@@ -60,11 +60,11 @@ class Textfile:
         self._fault = ""
 
     def is_due(self, now: float) -> bool:
-        """Return True if the file is to be written now, a monotonic second."""
+        """Return True if the file must be written at a monotonic time (s)."""
         return self._path is not None and now >= self._due
 
     def write(self, metrics: HostMetrics, now: float) -> None:
-        """Replace the file; log the begin and the end of a failure."""
+        """Replace the file; log the beginning and the end of a failure."""
         self._due = now + PERIOD
         fault, path = "", self._path
         assert path is not None
@@ -79,7 +79,7 @@ class Textfile:
         self._fault = fault
 
     def remove(self) -> None:
-        """Remove the file, whose values would be of the past."""
+        """Remove the file, because its values are no longer current."""
         if self._path is not None:
             with suppress(OSError):
                 self._path.unlink()

@@ -1,4 +1,4 @@
-"""`rosrm web` killed again and again while browsers and programs use it: nothing else notices."""
+"""`rosrm web` killed repeatedly while browsers and programs use it; the cluster is not affected."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def load(web: Gateway):
 
 
 def test_nothing_notices_a_gateway_that_is_killed_20_times(make_cluster, monkeypatch, tmp_path):
-    """Nothing of it is in the record, no cycle is missed, and the master forgets its clients."""
+    """The record has no trace of the kills, no cycle is missed, and the master drops clients."""
     made = make_cluster(host("robot-1"), host("robot-2"))
     names = [f"talker-{number}" for number in range(10)]
     made.submit(*map(service, names))

@@ -115,7 +115,7 @@ def test_a_work_file_is_planned_and_applied(page, cluster, web):
 
 
 def test_an_application_is_reverted_by_its_plan(page, cluster):
-    """Its dialog lists the versions, and opens by Enter; the focus returns to its row."""
+    """Enter opens the dialog with the versions; on close, the focus returns to the row."""
     for names in (("one",), ("one", "two")):
         dialog = plan(page, work("back", *names))
         dialog.get_by_role("button", name="Apply: start 1").click()
@@ -174,7 +174,7 @@ def test_a_wrong_work_file_is_refused_with_its_error(page, cluster, text, error)
 
 
 def test_a_plan_that_no_longer_holds_is_refused(page, cluster):
-    """Another user was faster: the operator must plan again."""
+    """After a change by another user, the operator must plan again."""
     dialog = plan(page, work("late", "sleeper"))
     begin = dialog.get_by_role("button", name="Apply: start 1")
     begin.wait_for()
@@ -195,7 +195,7 @@ def test_a_viewer_sees_versions_but_cannot_plan(chromium, web, cluster):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_serious_finding_in_the_tab_and_a_dialog(chromium, web, scheme):
-    """Names, roles and contrasts, by axe-core."""
+    """axe-core checks names, roles and contrasts."""
     with tab(chromium, web.url, color_scheme=scheme) as page:
         log_in(page)
         found = Axe().run(page).response["violations"]

@@ -80,7 +80,7 @@ def test_the_command_prints_metrics_or_replaces_a_file(cluster, tmp_path):
 
 
 def test_a_slave_writes_the_metrics_of_its_host(cluster, collected):
-    """Beside those of the master, for a node exporter on that host."""
+    """The node exporter of the host can read them beside the metrics of the master."""
     file = collected / "rosrm_slave_robot-1.prom"
     expected = {
         'rosrm_slave_registered{host="robot-1"} 1',

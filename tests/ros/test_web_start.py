@@ -90,7 +90,7 @@ def test_a_port_in_use_is_one_sentence(ros):
 
 
 def test_unfinished_requests_keep_no_other_client_out(web):
-    """More of them than the gateway has connections; the heads of some are whole."""
+    """There are more such requests than connections; the heads of some are complete."""
     head = b"POST /v1/cordon HTTP/1.1\r\nHost: localhost\r\n"
     with ExitStack() as stack:
         for number in range(2 * MOST_CONNECTIONS):
@@ -110,7 +110,7 @@ def test_pages_are_bounded(web):
 
 
 def test_a_revoked_token_ends_its_streams_and_pages(ros, tmp_path):
-    """Without a restart; users that are still in the file notice nothing."""
+    """No restart is needed; the requests of users that stay in the file continue."""
     file = tmp_path / "tokens"
     file.touch(0o600)
     ada, eve = {"Authorization": f"Bearer {'a' * 32}"}, {"Authorization": f"Bearer {TOKEN}"}

@@ -71,7 +71,7 @@ def mark(page: Any, content: str) -> Any:
 
 
 def test_a_move_appears_live_with_its_arrow(page, cluster):
-    """In the picture, in the table, and in the summary; none of them needs a reload."""
+    """The picture, the table and the summary show the move without a reload."""
     page.get_by_role("button", name="1 min").click()
     narrow(page, "mover")
     page.get_by_text("no processes, no moves").wait_for()
@@ -107,7 +107,7 @@ def test_earlier_looks_back_and_now_follows_again(page):
 
 
 def test_the_wheel_zooms_and_the_picture_stops(page):
-    """Otherwise the part that the user looks at would move away."""
+    """The picture stops following, so the zoomed part stays in view."""
     page.get_by_text("live", exact=True).wait_for()
     area = page.locator(".rosrm-timeline").bounding_box()
     page.mouse.move(area["x"] + area["width"] / 4, area["y"] + area["height"] / 3)
@@ -124,7 +124,7 @@ def test_a_name_narrows_the_picture(page):
 
 
 def test_html_in_a_reason_stays_text(page, cluster):
-    """Only the unit test of the options looks at the text beside the pointer."""
+    """Only the unit test of the options checks the text beside the pointer."""
     narrow(page, "no-program")
     cluster.submit(job("no-program", HTML))  # each host is tried
     mark(page, HTML).wait_for()
@@ -133,7 +133,7 @@ def test_html_in_a_reason_stays_text(page, cluster):
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_serious_finding_of_an_accessibility_checker(chromium, web, scheme):
-    """Names, roles and contrasts of the timeline, by axe-core."""
+    """axe-core checks names, roles and contrasts of the timeline."""
     with tab(chromium, web.url, color_scheme=scheme) as page:
         open_timeline(page)
         mark(page, "loser").wait_for()

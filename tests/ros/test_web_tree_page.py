@@ -50,7 +50,7 @@ def cell(found: Any) -> Any:
 
 
 def test_the_tree_opens_closes_and_finds(page):
-    """By click, keys and search; a group shows the sums of its processes, and stays when closed."""
+    """Click, keys and search work; a group shows sums of its processes, also while closed."""
     nav = group(page, "nav", is_open=True)
     assert "failed" in nav.inner_text()
     assert nav.get_attribute("aria-level") == "1"

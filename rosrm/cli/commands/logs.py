@@ -190,8 +190,8 @@ def _client(ctx: typer.Context, domain: int | None, *, has_archive: bool) -> Ite
             if not has_archive:
                 raise
             connection.note(f"{error} Only collected logs are printed")
-            nobody = cast("MasterClient", NoConnection())
-            client = Client(connection=nobody, notify=connection.note)
+            no_master = cast("MasterClient", NoConnection())
+            client = Client(connection=no_master, notify=connection.note)
         yield client
 
 

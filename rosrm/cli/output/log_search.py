@@ -18,7 +18,7 @@ _COLOURS: Final = {Level.DEBUG: "2", Level.WARN: "33", Level.ERROR: "31", Level.
 
 @dataclass(frozen=True)
 class LineSearch:
-    """Which lines are shown, and how.
+    """Condition on the lines that are shown, and their form.
 
     Attributes:
         pattern: that a line must contain; None: any.

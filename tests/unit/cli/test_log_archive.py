@@ -29,7 +29,7 @@ def rig(client, tmp_path):
 
 
 def test_the_output_of_a_lost_host_is_read_from_the_archive(rosrm, rig):
-    """The command says so, and what the archive has."""
+    """The command prints that the host is gone, and until when its log was collected."""
     result = rosrm("logs", PROCESS, "--archive", str(rig.directory))
     assert (result.code, result.out) == (0, "hours ago\n" + LINES.decode())
     assert "nav: alpha is lost: the master received its last reading" in result.err

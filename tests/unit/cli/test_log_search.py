@@ -82,7 +82,7 @@ def test_a_time_far_from_that_of_the_supervisor_is_not_used():
 
 @pytest.mark.parametrize("time", [float("nan"), float("inf"), -1.0, 1e300])
 def test_impossible_times_count_as_unknown(time):
-    """They come from other hosts."""
+    """Times come from other hosts, which may send any number."""
     stream = LogStream("nav", timestamps=True)
     stream.write(LogChunk("nav", "alpha", 3, b"one\n", 0, 0, True, [(time, 0, 77), (time, 4, 0)]))
     assert [text for _, text in stream.take()] == [b"? one\n"]
@@ -187,7 +187,7 @@ def test_a_wrong_option_is_refused(rosrm, slaves, options, message):  # noqa: F8
 
 
 def test_a_time_is_a_span_or_a_date():
-    """Without a time zone it is local time."""
+    """A date without a time zone is local time."""
     utc = datetime(2026, 11, 27, 9, 30, tzinfo=timezone.utc)
     assert time_of("--since", "2026-11-27T09:30Z") == utc.timestamp()
     assert time_of("--since", "2026-11-27 10:30+01:00") == utc.timestamp()

@@ -26,7 +26,7 @@ def test_an_overlapping_move_has_no_blackout():
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_stop_first_is_a_blackout_until_the_destination_is_ready(restarted):
-    """From the order to stop; a restarted master does not know when that was."""
+    """The blackout begins at the order to stop, whose time a restarted master does not know."""
     cluster = migrations.two_hosts(overlap=False)
     cluster.machines["a"].stubborn.add("p")
     cluster.migrate("p")

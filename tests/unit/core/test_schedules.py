@@ -228,7 +228,7 @@ def test_a_job_that_loses_its_schedule_between_two_runs_runs_once() -> None:
 
 
 def test_a_job_that_loses_its_schedule_is_queued_like_a_new_one() -> None:
-    """Its place is after all that wait, and a host on which its last run failed is allowed."""
+    """The job waits after all others, and may use a host on which its last run failed."""
     cluster = Cluster("a")
     fields = {"restart": RestartPolicy("never"), "reschedule": ReschedulePolicy(1)}
     cluster.apply("app", job("p", schedule=EVERY_10_S, **fields))

@@ -60,7 +60,7 @@ def test_a_container_without_a_free_descriptor_takes_links_again_later(tmp_path)
 
 
 def test_a_component_that_cannot_be_destroyed_does_not_end_its_container(tmp_path):
-    """Its error is logged; it would otherwise leave the executor, which serves the other nodes."""
+    """The error is logged; otherwise it would end the executor, which serves the other nodes."""
     name, errors = str(tmp_path), []
     node = SimpleNamespace(destroy_node=lambda: 1 / 0)
     with ThreadPoolExecutor() as threads:

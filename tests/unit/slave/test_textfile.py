@@ -44,7 +44,7 @@ def test_the_text_has_the_values_of_the_host():
 
 
 def test_the_page_has_the_metrics():
-    """Name and meaning of each, in order."""
+    """The page lists name and meaning of each metric, in the same order."""
     page = (ROOT / "docs/reference/metrics.md").read_text()
     found = re.findall(r"^\| `(rosrm_slave_\w+)` \| .*? \| (.*) \|$", page, re.MULTILINE)
 
@@ -53,7 +53,7 @@ def test_the_page_has_the_metrics():
 
 
 def test_prometheus_reads_the_text():
-    """Its own parser finds each metric as a gauge."""
+    """The parser of Prometheus finds each metric as a gauge."""
     parser = pytest.importorskip("prometheus_client.parser")
     families = list(parser.text_string_to_metric_families(text_of(METRICS, "h\n").decode()))
 
@@ -63,7 +63,7 @@ def test_prometheus_reads_the_text():
 
 
 def test_the_file_is_replaced_as_a_whole_and_removed_at_the_end(tmp_path):
-    """Another user reads it, never a part of it, and no values of the past stay."""
+    """Another user can read the whole file; the slave removes it when it stops."""
     made = Textfile(tmp_path, "h")
     assert made.is_due(0.0)
     made.write(METRICS, 0.0)
@@ -79,7 +79,7 @@ def test_the_file_is_replaced_as_a_whole_and_removed_at_the_end(tmp_path):
 
 
 def test_without_a_directory_nothing_is_written():
-    """The default."""
+    """The default setting is no directory."""
     made = Textfile(Path(), "h")
 
     assert not made.is_due(0.0)

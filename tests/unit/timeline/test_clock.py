@@ -23,7 +23,7 @@ def test_times_continue_over_a_restart_of_the_master():
 
 
 def test_the_present_time_follows_the_master():
-    """Its seconds since its start become seconds of the timeline, and unix time."""
+    """Seconds since the master's start become seconds of the timeline, and unix time."""
     clock = EventClock()
     clock.take(FIRST)
     clock.take(replace(FIRST, elapsed=1.0, wall_time=1.7e9 + 60))  # it was restarted

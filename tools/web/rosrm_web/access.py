@@ -38,13 +38,13 @@ class Access:
         self._open: dict[object, tuple[User, Callable[[], object]]] = {}
 
     async def follow_file(self) -> None:
-        """Look at the file regularly, until the task is cancelled."""
+        """Check the file for changes every `PERIOD`, until the task is cancelled."""
         while self._path is not None:
             await asyncio.sleep(PERIOD)
             self.look(self._path)
 
     def look(self, path: Path) -> None:
-        """Read the file again if it has changed; end the requests and pages of users that left it.
+        """Read the file again if it has changed; end the requests and pages of removed users.
 
         A user with another role or token is another user.
 
@@ -58,10 +58,10 @@ class Access:
             self.users = read_tokens(path)
         except ConfigError as error:
             self.trouble = str(error)
-            _log.error("tokens: the former ones stay valid: %s", error)
+            _log.error("tokens: the former tokens stay valid: %s", error)
             return
         self.trouble = ""
-        _log.info("tokens: read again: %d users", len(self.users))
+        _log.info("tokens: file read again: %d users", len(self.users))
         for user, end in list(self._open.values()):
             if user not in self.users:
                 end()
@@ -89,7 +89,7 @@ class Access:
 
 
 def _state(path: Path | None) -> tuple[int, ...]:
-    """Return values that change with the file or its mode; (): it is not there."""
+    """Return values that change with the file or its mode; (): there is no file."""
     with suppress(OSError):
         if path is not None:
             state = path.stat()

@@ -86,7 +86,7 @@ def web(  # noqa: PLR0913, PLR0917 - an argument for each option
     )  # fmt: skip
     _log_to_stderr()
     cluster = ctx.obj.cluster if isinstance(ctx.obj, CommonOptions) else None
-    open_archive(archive)  # refuses a directory that is none
+    open_archive(archive)  # refuses a directory without an archive
     gateway = Gateway(partial(_connect, ros_settings(ctx, domain), cluster), archive)
     with open_socket(settings) as listener:
         rights = "operators may act" if settings.is_acting else "it only reads"

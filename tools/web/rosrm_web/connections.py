@@ -15,7 +15,7 @@ MOST_CONNECTIONS: Final = 128
 MOST_WEBSOCKETS: Final = 64
 #: Seconds for the request line and the headers, and before them for the TLS handshake.
 HEAD_TIMEOUT: Final = 10.0
-#: Seconds for which a client may take too little of an answer.
+#: Seconds for which a client may read its answer too slowly.
 READ_TIMEOUT: Final = 20.0
 
 
@@ -25,14 +25,14 @@ class Connection(H11Protocol):
     uvicorn limits the time between two requests, and `guard` that of a body. The limits here are on
     the head of a request, on the TLS handshake, and on the reading of answers. One connection more
     than `MOST_CONNECTIONS` ends the oldest one that waits for its client, so that no number of
-    unfinished requests keeps other clients out. Without such a connection the new one ends.
+    unfinished requests blocks other clients. Without such a connection the new one ends.
 
     Args:
         tls: context of the server; None: plain HTTP.
         uvicorn: arguments of `H11Protocol`.
 
     Attributes:
-        begun: monotonic second of its beginning.
+        begun: monotonic time (s) of its beginning.
     """
 
     def __init__(self, *, tls: ssl.SSLContext | None = None, **uvicorn: Any) -> None:
@@ -79,7 +79,7 @@ class Connection(H11Protocol):
             self.data_received(self._early)
 
     def data_received(self, data: bytes) -> None:
-        """Take data; from the first byte of a request on, its head has a limit."""
+        """Process data; start the time limit for a head at the first byte of a request."""
         if self._handshake is not None:
             self._early += data
             return
@@ -115,7 +115,7 @@ class Connection(H11Protocol):
         self._stop_timer("read")
 
     def connection_lost(self, error: Exception | None) -> None:
-        """Forget the connection."""
+        """Stop the timers of the closed connection."""
         self._stop_timer("head")
         self._stop_timer("read")
         super().connection_lost(error)

@@ -1,9 +1,10 @@
 """Blackout of a migration: the time in which neither its source nor its destination is active.
 
-It begins with the first step that changes the source (a stop, a deactivation, a freeze: those with
-an undo), or with the report of a handoff that the source is silent. It ends with the commit, which
-follows an active destination; with the report of a handoff that the destination is active; or with
-the last step on the destination after the commit, by which a restored process joins ROS again.
+The blackout begins with the first step that changes the source (a stop, a deactivation or a freeze,
+which have an undo), or with the report of a handoff that the source is silent. The blackout ends
+with the commit, which follows an active destination; with the report of a handoff that the
+destination is active; or with the last step on the destination after the commit, by which a
+restored process joins the ROS graph again.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from rosrm.model.plan import Aim, Commit, Execute, ReportPhase, SetLifecycle, St
 
 
 def note_begun(migration: Migration, step: Step, now: float) -> None:
-    """Note the begin of a step; again if it has begun before."""
+    """Note the beginning of a step; may be called again for a step."""
     is_new = migration.silent_at is None and migration.undo is None and not migration.committed
     if is_new and step.undo is not None and _changes_source(step, migration):
         migration.silent_at = now

@@ -58,7 +58,7 @@ def test_a_migration_is_a_move_with_its_cause():
 
 
 def test_a_migration_within_a_host_is_a_replacement():
-    """Each instance has its time there, and neither the moves nor the host's figures count it."""
+    """Each instance has its time on the host; the host's figures count no move."""
     facts = {"from": "a", "to": "a", "cause": "version 2", "strategy": "handoff", "seconds": 1}
     made = report(
         (0, "assigned", "p", "a", "", {"number": 1}),

@@ -81,7 +81,7 @@ async def ended(reader):
 @pytest.mark.parametrize("before", [b"", HEAD + b"\r\n"])
 @pytest.mark.parametrize("sent", [b"", b"G", HEAD])
 def test_a_head_that_never_ends_is_dropped(monkeypatch, before, sent):
-    """The first one of a connection and later ones; a byte now and then does not help."""
+    """The limit holds for the first and later heads of a connection; bytes do not extend it."""
     monkeypatch.setattr(connections, "HEAD_TIMEOUT", 0.2)
 
     async def scene(*address):

@@ -15,7 +15,7 @@ PLAN = (
 
 
 def test_the_summary_counts_the_actions():
-    """In a fixed order, for the text of a button."""
+    """The actions are in a fixed order, because the summary is the text of a button."""
     assert summary(PLAN) == "start 2, stop 2, replace 2"
     assert summary(()) == ""
 

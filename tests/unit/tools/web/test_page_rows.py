@@ -51,7 +51,7 @@ def test_a_host_shows_usage_limit_and_marks():
 
 
 def test_a_host_shows_its_devices():
-    """As `rosrm hosts` does."""
+    """The cell has the same text as `rosrm hosts`."""
     devices = (DeviceRow("camera", "front", holders=("slam#12",)), DeviceRow("gpu", "0", free=1.0))
 
     assert host_rows([host("h", devices=devices)])["h"]["devices"] == "camera 0/1, gpu 1/1"

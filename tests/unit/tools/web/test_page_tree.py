@@ -33,7 +33,7 @@ def test_a_process_is_below_its_application_and_its_namespace_or_array():
 
 
 def test_the_row_of_a_group_sums_its_processes():
-    """It has the style of its gravest state, also while it is closed."""
+    """The row has the style of the gravest state, also while the group is closed."""
     row = tree_rows(PROCESSES, CLOSED)["nav/"]
 
     assert row["state"] == "2 running, 1 failed, 1 set aside"
@@ -56,7 +56,7 @@ def test_all_that_is_shown_is_below_open_groups(touched, default):
 
 
 def test_a_search_finds_name_application_host_state_and_reason():
-    """In upper or lower case, and only within the chosen state."""
+    """Upper and lower case are equal, and only processes in the chosen state are found."""
 
     def found(**choice: str) -> list[str]:
         return [row.name for row in PROCESSES if Choice(**choice).admits(row)]
@@ -68,7 +68,7 @@ def test_a_search_finds_name_application_host_state_and_reason():
 
 
 def test_all_groups_open_and_close_at_once():
-    """Also those that the user has opened or closed before."""
+    """Groups that the user has opened or closed before follow, too."""
     folding = Folding(default=True, touched={"nav/": False})
 
     folding.set_all(is_open=True)

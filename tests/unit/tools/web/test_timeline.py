@@ -68,7 +68,7 @@ def test_a_bar_has_the_style_of_the_state_or_of_the_end_of_the_process():
 
 
 def test_a_move_is_an_arrow_between_the_bars_and_a_row_of_the_table():
-    """The same for those who see the picture and for those who hear the table."""
+    """A screen reader reads from the table the same moves as the picture shows."""
     made = drawn(*RUNS, (30, "migrated", "p", "b", "", MOVED), processes=[process("p", host="b")])
 
     assert [bar[:3] for bar in made.bars] == [(ms(10), ms(30), 1), (ms(30), 0, 3)]
@@ -87,7 +87,7 @@ def test_a_migration_that_failed_has_no_arrow():
 
 
 def test_a_process_from_before_the_known_events_is_drawn():
-    """Its bar begins with the known events at the latest; ended ones have none."""
+    """The bar begins at the first known event at the latest; an ended process has no bar."""
     made = drawn(
         (0, "host_cordoned", "", "a"),
         processes=[process("p", since=90.0), process("q"), process("r", "failed")],
@@ -97,7 +97,7 @@ def test_a_process_from_before_the_known_events_is_drawn():
 
 
 def test_lost_hosts_limits_and_failures_are_marked():
-    """Each with its time; a loss without an end lasts to the right edge."""
+    """Each mark is at its time; a loss without an end lasts to the right edge."""
     made = drawn(
         *RUNS, (20, "over_limit", "", "a", "", {"resource": "memory"}),
         (25, "under_limit", "", "a"), (30, "failed", "p", "a", "exit code 1\ndetails"),
@@ -157,7 +157,7 @@ def test_a_look_back_stays_at_its_time_when_old_events_are_forgotten():
 
 
 def test_a_bar_keeps_its_row_when_another_one_leaves_the_view():
-    """Otherwise bars would jump while the picture moves on."""
+    """Bars must not change their rows while the picture follows the cluster."""
     lines = (
         (0, "assigned", "old", "a"), (1, "assigned", "p", "a"), (5, "finished", "old", "a"),
         (6, "assigned", "q", "a"),

@@ -201,7 +201,7 @@ class ProcessDialog(Dialog):
         self._explaining = background_tasks.create(self._explain(name))
 
     def stop(self) -> None:
-        """Request nothing more; drop what a slow master has not answered."""
+        """End all requests, also one that a slow master has not answered."""
         self._log.stop()
         if self._explaining is not None:
             self._explaining.cancel()

@@ -1,4 +1,4 @@
-"""Plans of changes: what would happen and why, and the button that begins it."""
+"""Plans of changes: their actions with reasons, and the button that applies them."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Request(Protocol):
 
 
 class Plan:
-    """A part of a dialog that shows a plan, and lets the operator begin it.
+    """A part of a dialog that shows a plan, and lets the operator apply it.
 
     Args:
         gateway: sends the requests.

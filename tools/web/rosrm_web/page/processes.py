@@ -14,7 +14,7 @@ from rosrm_web.page.tree import MOST_OPEN, Choice, Folding, is_group, tree_rows
 from rosrm_web.page.views import STATE, Table, column
 
 #: Name with its indentation, and for a group a mark that shows if it is open. A screen reader gets
-#: both from the row, which is why the cell is rendered again with each change of its row.
+#: both from the row, so each change of the row renders the cell again.
 _NAME: Final = """params => {
   const row = params.eGridCell.closest(".ag-row"), {level, open} = params.data;
   row.closest("[role=grid]")?.setAttribute("role", "treegrid");
@@ -53,7 +53,7 @@ _COLUMNS: Final = (
         ":cellRenderer": _NAME,
         ":equals": "() => false",
         ":comparator": "new Intl.Collator('en', {numeric: true}).compare",
-        # The grid would go to the next cell.
+        # Otherwise the grid would move the focus to the next cell.
         ":suppressKeyboardEvent": "params => params.data.open === false"
         " && params.event.key === 'ArrowRight'",
     },
@@ -74,7 +74,7 @@ _OPTIONS: Final = {
 
 
 class Processes:
-    """The processes, those that a user has chosen, as a tree.
+    """The processes that a user has chosen, as a tree.
 
     Args:
         on_open: called with the name of a process that the user opens.

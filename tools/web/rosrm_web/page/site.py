@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 #: Highest number of pages at the same time.
 MOST_PAGES: Final = 32
-#: Seconds after which a page to which no browser has connected makes room for another one.
+#: Seconds after which a page without a browser may be closed to make room for another page.
 _UNUSED: Final = 5.0
 #: Seconds after which the page of an absent browser is dropped. A browser that returns earlier, for
 #: example to its Wi-Fi, keeps its open dialogs and gets all changes.
@@ -148,7 +148,7 @@ class Page:
             self._state = ui.label().props("role=status aria-live=polite")
             ui.space()
             ui.label("operator" if may_act else "read-only")
-        self._said = ui.label().classes("sr-only").props("role=status")
+        self._announcement = ui.label().classes("sr-only").props("role=status")
         self._strip = ui.row().classes("w-full").props('role=region aria-label="Problems"')
 
     def _acted(self, action: str) -> None:
@@ -185,7 +185,7 @@ class Page:
     def _show_problems(self, found: list[rows.Problem]) -> None:
         self._problems = found
         self._strip.clear()
-        self._said.text = f"Problems: {', '.join(one.text for one in found) or 'none'}"
+        self._announcement.text = f"Problems: {', '.join(one.text for one in found) or 'none'}"
         with self._strip:
             for problem in found:
                 button = ui.button(problem.text, on_click=partial(self._filter, problem))

@@ -25,7 +25,7 @@ MOST_KEPT: Final = 10_000
 
 
 class Feed:
-    """The newest events as a timeline; nothing is read before somebody looks.
+    """The newest events as a timeline; no event is read before a page shows the timeline.
 
     Attributes:
         timeline: of the kept events.

@@ -1,4 +1,4 @@
-"""Tables of the page: what all have in common, and the columns of hosts and events."""
+"""Tables of the page: their common behaviour, and the columns of hosts and events."""
 
 from __future__ import annotations
 
