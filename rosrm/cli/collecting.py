@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 #: Seconds for one search for the master, and until the archive is tried again after an error.
 _SEARCH: Final = 3.0
 _AGAIN: Final = 10.0
+#: Files in the directory of an archive that was never written.
+_UNUSED: Final = frozenset({"collector.lock", "lost+found"})
 
 
 def collect(
@@ -126,7 +128,13 @@ class Collecting:
 
 
 def _make(directory: Path) -> None:
+    """Create the directory for its owner alone; refuse one that has other uses."""
     try:
+        names = {file.name for file in directory.iterdir()} if directory.is_dir() else set()
+        if "hosts" not in names and not names <= _UNUSED:
+            raise ConfigError(
+                f"{directory} has other files, and is no log archive: name a new directory"
+            )
         make_private_directory(directory)
     except OSError as error:
         raise ConfigError(f"the log archive {directory} cannot be used: {error.strerror}") from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import stat
 import time
 
 import pytest
@@ -110,6 +111,17 @@ def test_a_wrong_option_of_the_collector_is_refused(rosrm, tmp_path, options, me
     result = rosrm("collect-logs", str(tmp_path / "archive"), *options)
     assert (result.code, message in result.err) == (2, True)
     assert not (tmp_path / "archive").exists()
+
+
+def test_a_directory_with_other_files_is_refused_and_keeps_its_mode(rosrm, tmp_path):
+    """Otherwise it would be closed to its other readers."""
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    folder.chmod(0o755)
+    (folder / "file").touch()
+    result = rosrm("collect-logs", str(folder))
+    assert (result.code, "has other files" in result.err) == (2, True)
+    assert stat.S_IMODE(folder.stat().st_mode) == 0o755
 
 
 def test_a_directory_that_cannot_be_used_is_refused(rosrm, tmp_path):
