@@ -91,7 +91,10 @@ class Watcher:
                 forget()
         self._after = listing.last_sequence
         for call in self.on_events if listing.events else ():
-            call(listing.events)
+            try:
+                call(listing.events)
+            except Exception:  # noqa: BLE001 - one reader must not stop the others, or the watcher
+                _log.exception("a part of the gateway cannot read new events")
 
     def _list(self, client: Client) -> Listing:
         self.load = client.master_load()

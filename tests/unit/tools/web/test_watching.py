@@ -1,0 +1,52 @@
+"""The watcher of the master: it goes on whatever happens to those who read its events."""
+
+from __future__ import annotations
+
+import asyncio
+
+from rosrm.model.rows import EventRow, Listing
+from rosrm_web.gateway import Gateway
+
+
+class Master:
+    """A client of a master with one more event each time."""
+
+    def __init__(self) -> None:
+        self.newest = 0
+
+    def list(self, **_):
+        self.newest += 1
+        event = EventRow(self.newest, 1.7e9, 1.0, "assigned", "p", "a", "")
+        return Listing("m", 1.0, self.newest, events=[event])
+
+    def master_load(self):
+        """Return nothing: no load was published."""
+
+    def close(self):
+        """Leave nothing."""
+
+
+def test_a_reader_of_events_that_fails_stops_neither_the_others_nor_the_watcher():
+    """The page would go on saying that the master is up, and show nothing new."""
+
+    async def scene() -> None:
+        gateway = Gateway(lambda _: Master())
+        seen: list[int] = []
+        third = asyncio.Event()
+
+        def fail(_: object) -> None:
+            raise KeyError("fact")
+
+        def read(rows) -> None:
+            seen.extend(row.sequence for row in rows)
+            if len(seen) == 3:
+                third.set()
+
+        gateway.watcher.on_events[:] = [fail, read]
+        watching = asyncio.create_task(gateway.watcher.run())
+        await asyncio.wait_for(third.wait(), 30.0)
+        assert seen[:3] == [1, 2, 3]
+        watching.cancel()
+        gateway.close()
+
+    asyncio.run(scene())
