@@ -59,7 +59,7 @@ class ArchiveWriter:
         self._remove_remains()
 
     def read_again(self) -> None:
-        """Read what the archive has, e.g. after somebody removed files; raises `OSError`."""
+        """Read the segments again, e.g. after a user removed files; raises `OSError`."""
         self._segments = read_segments(self._directory)
         self._unchecked = self._limits.keep
 

@@ -96,7 +96,7 @@ class LogCollector:
         try:
             self._collect_due(master)
             self._archive.apply_limits()
-        except FileNotFoundError:  # somebody removed files
+        except FileNotFoundError:  # a user removed files
             self._archive.read_again()
             raise
 

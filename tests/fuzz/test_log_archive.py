@@ -31,7 +31,7 @@ CONTENT = st.binary(max_size=200).flatmap(lambda text: st.sampled_from([text, gz
 @example({"p.1.0.0-9.log.gz": gzip.compress(b"x" * 9)[:-4]}, 0, 0.0, 0)
 @settings(max_examples=200, deadline=None)
 def test_a_damaged_archive_is_read_or_refused(files, tail, since, offset):
-    """The next collector can continue with it, too."""
+    """The next collector can also continue with the archive."""
     with TemporaryDirectory() as folder:
         directory = Path(folder)
         here = directory / "hosts" / "alpha"

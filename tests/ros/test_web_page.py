@@ -189,7 +189,7 @@ def test_the_page_of_an_operator_who_becomes_a_viewer_is_replaced(chromium, clus
 
 
 def act(page: Any, action: str, warning: str) -> None:
-    """Press the button of an action twice, and then that of the one question with this warning."""
+    """Press the button of an action twice, and confirm the single question with this warning."""
     page.get_by_role("button", name=action, exact=True).evaluate("it => { it.click(); it.click() }")
     question = page.get_by_role("dialog").filter(has_text=warning)
     question.get_by_role("button", name=action, exact=True).click()
@@ -205,7 +205,7 @@ def test_a_reader_has_no_buttons(page):
 
 
 def test_a_lost_master_is_shown_and_comes_back(chromium, make_cluster):
-    """The header says so; nothing has to be loaded again."""
+    """The header shows that the master is lost; the page need not be loaded again."""
     cluster = make_cluster(host("a"), liveness=STEADY)
     with gateway(cluster.ros) as web, tab(chromium, web.url) as page:
         page.get_by_text("master: up").wait_for()

@@ -100,7 +100,7 @@ def test_unfinished_requests_keep_no_other_client_out(web):
 
 
 def test_pages_are_bounded(web):
-    """The next one is refused with a sentence; a page that no browser opened makes room."""
+    """One more page is refused with a sentence; a page without a browser is closed for it."""
     refused = wait_until(
         lambda: next((one for one in [web.ask("/")] if one.status == 503), None),
         "a page is refused",

@@ -122,7 +122,7 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
     from rosrm.client.logs import LogSelection
 
     if follow and until:
-        raise ConfigError("--until: -f continues without an end; give one of the two")
+        raise ConfigError("--until: -f prints output without an end; give either -f or --until")
     is_plain = raw or not is_terminal()
     search = _search(
         grep, level, time_of("--until", until), as_json=as_json,
@@ -210,13 +210,11 @@ def collect_logs(  # noqa: PLR0917 - an argument for each option
     ] = "2s",
     keep: Annotated[
         str,
-        typer.Option(
-            "--keep", metavar="SIZE", help="Most bytes of the archive; the oldest are removed."
-        ),
+        typer.Option("--keep", metavar="SIZE", help="Largest size of the archive, e.g. 100GB."),
     ] = "20GB",
     keep_host: Annotated[
         str,
-        typer.Option("--keep-host", metavar="SIZE", help="Most bytes of the logs of one host."),
+        typer.Option("--keep-host", metavar="SIZE", help="Largest size of the logs of one host."),
     ] = "5GB",
     max_rate: Annotated[
         str,

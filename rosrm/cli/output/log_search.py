@@ -44,7 +44,7 @@ def pattern_of(option: str, text: str) -> re.Pattern[str]:
     """Return the regular expression of an option; raises `ConfigError`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a set that later versions of Python may read anew
+            warnings.simplefilter("ignore")  # of a set that a later Python may read differently
             return re.compile(text)
     except (re.error, RecursionError, OverflowError) as error:
         raise ConfigError(

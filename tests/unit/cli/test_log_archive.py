@@ -84,7 +84,7 @@ def test_a_directory_that_is_no_archive_is_refused(rosrm, rig, tmp_path):
 
 
 def test_a_directory_that_cannot_be_looked_into_is_refused(rosrm, rig):
-    """For example that of another user."""
+    """The archive may belong to another user."""
     result = rosrm("logs", PROCESS, "--archive", "a" * 300)
     assert (result.code, "cannot be read: File name too long" in result.err) == (1, True)
 

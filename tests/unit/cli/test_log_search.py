@@ -110,7 +110,7 @@ def test_until_leaves_out_later_starts():
 
 
 def test_an_ambiguous_expression_is_taken_without_a_warning(recwarn):
-    """Python would print one, with a path of its own."""
+    """Otherwise Python would print a warning with the path of one of its modules."""
     assert pattern_of("--grep", "[[nav]").search("[nav]: text")
     assert not recwarn.list
 
@@ -176,7 +176,7 @@ def test_the_processes_of_an_application_are_searched(rosrm, client, slaves):  #
         (["talker", "--level", "loud"], "a level is debug, info, warn, error or fatal"),
         (["talker", "--since", "noon"], "e.g. 10min, or a time, e.g. 2026-11-27T09:30"),
         (["talker", "--until", "2026-13-01"], "--until: "),
-        (["talker", "--until", "1h", "-f"], "-f continues without an end"),
+        (["talker", "--until", "1h", "-f"], "-f prints output without an end"),
         (["talker", "--app", "nav"], "give the names of processes, or an application"),
         ([], "give the names of processes, or an application"),
     ],

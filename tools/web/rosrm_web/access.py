@@ -78,7 +78,7 @@ class Access:
             close()
 
     def open(self, user: User, end: Callable[[], object]) -> Callable[[], None]:
-        """Let `look` call a function for a revoked token; the returned function ends that."""
+        """Let `look` call `end` if the token is revoked; the returned function ends that."""
         key = object()
         self._open[key] = user, end
 

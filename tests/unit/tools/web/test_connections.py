@@ -147,7 +147,7 @@ def test_one_request_too_many_in_progress_ends(monkeypatch):
 
 
 def test_a_reader_that_takes_nothing_is_ended(monkeypatch):
-    """The rest of its answer is dropped."""
+    """The gateway drops the rest of the answer."""
     monkeypatch.setattr(connections, "READ_TIMEOUT", 0.2)
 
     async def scene(*address):

@@ -75,7 +75,7 @@ def test_nothing_is_read_while_nobody_looks():
 
 
 def test_the_events_of_a_former_journal_are_dropped():
-    """Their higher sequences would hide the new events."""
+    """The higher sequences of these events would hide the new events."""
 
     async def scene() -> None:
         master = Master()

@@ -79,7 +79,7 @@ def test_a_move_is_an_arrow_between_the_bars_and_a_row_of_the_table():
 
 
 def test_a_migration_that_failed_has_no_arrow():
-    """The table has it with the reason."""
+    """The table shows the migration with the reason."""
     made = drawn(*RUNS, (30, "stayed", "p", "a", "p stays: b is lost", MOVED))
 
     assert made.moves == []
@@ -148,7 +148,7 @@ def test_a_look_back_shows_what_was_then():
 
 
 def test_a_look_back_stays_at_its_time_when_old_events_are_forgotten():
-    """Seconds of the timeline count from its first event, which is another one then."""
+    """Seconds of the timeline count from its first event, which changes when events are dropped."""
     lines = (*RUNS, (100, "assigned", "q", "b"))
 
     for known, now in ((lines, 200.0), (lines[1:], 190.0)):
@@ -184,7 +184,7 @@ def test_of_very_many_runs_the_longest_are_drawn():
 
 
 def test_unprintable_characters_reach_no_table():
-    """Messages come from other machines."""
+    """Messages come from other machines, which may send any text."""
     made = drawn(*RUNS, (30, "failed", "p", "a", "\x1b[31mexit code 1"))
 
     (row,) = made.table.values()

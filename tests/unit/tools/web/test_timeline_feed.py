@@ -41,7 +41,7 @@ def row(sequence: int, process: str) -> EventRow:
 
 
 def test_the_events_are_read_once_and_then_followed():
-    """All browsers share them; an event that is known already counts once."""
+    """All browsers share the events; an event that is read twice counts once."""
 
     async def scene() -> None:
         master = Master()
