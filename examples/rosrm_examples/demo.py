@@ -181,7 +181,7 @@ def _closing(summary: dict[str, Any], processes: Sequence[ProcessRow], out: Path
     moves = summary["migrations"]
     lines = [
         processes_line,
-        f"{summary['assignments']} assignments ({hosts}), {moves} migrations off a full host",
+        f"{summary['assignments']} assignments ({hosts}), migrations off a full host: {moves}",
         f"map of {summary['map_points']:,} points{quality}",
         "",
         *(f"  {out / name}" for name in LEFT),

@@ -197,7 +197,7 @@ def title_of(record: Record) -> str:
     processes = sum(1 for _ in record.of_kind("submitted"))
     return (
         f"{processes} processes on {len(record.hosts)} hosts of {record.budget / 2**20:.0f} MiB, "
-        f"{len(record.moves())} migrations"
+        f"migrations: {len(record.moves())}"
     )
 
 
