@@ -281,9 +281,11 @@ class LogReader:
             why = "" if row.reason.startswith(f"{host} is ") else why  # same content
         others = [f"`--host {other}`" for other in self._hosts if other not in self._away]
         older = f"; an older part may be read with {listed(others, 'or')}" if others else ""
+        collected = "" if self.archive else ", or read a log archive (`rosrm logs --archive DIR`)"
         raise Refused(
             f"the log of {name} is on {host}{why}{known}. To read it, start the slave of {host} "
-            f"again (`rosrm slave`){older}. `rosrm events --process {name}` shows what happened"
+            f"again (`rosrm slave`){collected}{older}. `rosrm events --process {name}` shows what "
+            "happened"
         )
 
     def _explain_nothing(self, found: Sequence[tuple[str, int]]) -> None:

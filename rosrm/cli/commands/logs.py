@@ -130,7 +130,7 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
     )  # fmt: skip
     selection = LogSelection(tail or 0, time_of("--since", since), host, follow)
     collected = open_archive(archive)
-    with _client(ctx, domain, has_archive=collected is not None) as client:
+    with _client(ctx, domain, app, has_archive=collected is not None) as client:
         chosen = _names(client, names or (), app)
         width = max(map(len, chosen)) if len(chosen) > 1 else 0
         streams = [
@@ -177,7 +177,9 @@ def open_archive(directory: Path | None) -> LogArchive | None:
 
 
 @contextmanager
-def _client(ctx: typer.Context, domain: int | None, *, has_archive: bool) -> Iterator[Client]:
+def _client(
+    ctx: typer.Context, domain: int | None, app: str, *, has_archive: bool
+) -> Iterator[Client]:
     """Create a client of the master; with an archive, the master may be gone."""
     from rosrm.client.client import Client
     from rosrm.client.no_master import NoConnection
@@ -189,7 +191,10 @@ def _client(ctx: typer.Context, domain: int | None, *, has_archive: bool) -> Ite
         except NoMaster as error:
             if not has_archive:
                 raise
-            connection.note(f"{error} Only collected logs are printed")
+            if app:
+                hint = "Without a master, give the names of the processes in place of --app"
+                raise NoMaster(f"{error}. {hint}") from None
+            connection.note(f"only collected logs are printed: {error}")
             no_master = cast("MasterClient", NoConnection())
             client = Client(connection=no_master, notify=connection.note)
         yield client

@@ -62,15 +62,27 @@ def test_older_instances_come_from_the_archive_and_newer_ones_from_their_host(ro
     assert lines == ["hours ago", *LINES.decode().splitlines(), "now"]
 
 
-def test_without_a_master_the_archive_is_read(rosrm, rig, monkeypatch):
+@pytest.fixture
+def no_master(monkeypatch):
+    """Let no master answer."""
+
     def connect(*_):
-        raise NoMaster("no master answers in domain 7.")
+        raise NoMaster("no master answers in domain 7")
 
     monkeypatch.setattr(connection, "connect", connect)
+
+
+def test_without_a_master_the_archive_is_read(rosrm, rig, no_master):
     result = rosrm("logs", PROCESS, "--archive", str(rig.directory), "--tail", "1")
     assert (result.code, result.out) == (0, "three\n")
-    assert "no master answers in domain 7. Only collected logs are printed" in result.err
+    assert "only collected logs are printed: no master answers in domain 7\n" in result.err
     assert rosrm("logs", PROCESS).code == 3
+
+
+def test_without_a_master_an_application_is_not_called_unknown(rosrm, rig, no_master):
+    """The archive knows processes only, so the message asks for their names."""
+    result = rosrm("logs", "--app", "nav", "--archive", str(rig.directory))
+    assert (result.code, "processes in place of --app" in result.err) == (3, True)
 
 
 def test_a_process_that_master_and_archive_do_not_know_is_refused(rosrm, rig):

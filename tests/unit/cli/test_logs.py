@@ -279,7 +279,8 @@ def test_a_host_that_is_away_is_not_asked(rosrm, client, slaves, state):
     client.processes = [process("talker", "unreachable", reason="alpha is lost")]
     result = rosrm("logs", "talker")
     since = "the log of talker is on alpha. talker has been unreachable for 12 s: alpha is lost."
-    remedy = "To read it, start the slave of alpha again (`rosrm slave`). `rosrm events"
+    archive = "or read a log archive (`rosrm logs --archive DIR`)"
+    remedy = f"To read it, start the slave of alpha again (`rosrm slave`), {archive}. `rosrm events"
     assert (result.code, f"{since} {remedy}" in result.err) == (1, True)
     client.processes = [process("talker", "unreachable")]
     verb = "has" if state == "left" else "is"
