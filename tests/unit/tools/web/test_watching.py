@@ -1,4 +1,4 @@
-"""The watcher of the master: it goes on whatever happens to those who read its events."""
+"""The watcher of the master continues after any failure of a reader of its events."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Master:
 
 
 def test_a_reader_of_events_that_fails_stops_neither_the_others_nor_the_watcher():
-    """The page would go on saying that the master is up, and show nothing new."""
+    """Otherwise the page would still show the master as up, and no new event."""
 
     async def scene() -> None:
         gateway = Gateway(lambda _: Master())
