@@ -98,7 +98,7 @@ class Guard:
             return
         scope["user"] = user
         scope["may_act"] = self._settings.is_acting and user.role == "operator"
-        acts = scope.get("method", "GET") not in _SAFE
+        acts = scope.get("method", "GET") not in _SAFE and scope["path"] != LOGIN
         note = f"{user.name}: {scope['method']} {scope['path']!r:.100}" if acts else ""
         with self._access.open_request(user):
             await self._app(scope, receive, self._hardened(send, note, is_page=is_page))

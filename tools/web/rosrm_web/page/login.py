@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from html import escape
 from typing import TYPE_CHECKING, Final
 from urllib.parse import parse_qs
@@ -14,6 +15,8 @@ from rosrm_web.tokens import COOKIE, user_of
 if TYPE_CHECKING:
     from rosrm_web.access import Access
     from rosrm_web.settings import Settings
+
+_log = logging.getLogger("rosrm.web")
 
 _FORM: Final = """<!doctype html>
 <html lang="en"><head><title>rosrm: token</title><link rel="icon" href="data:,">
@@ -39,8 +42,11 @@ class Login:
         """Check the token of the form, and set the cookie."""
         body = (await request.body()).decode("latin-1")
         token = parse_qs(body).get("token", [""])[0].strip()
-        if user_of(f"Bearer {token}", self._access.users) is None:
+        user = user_of(f"Bearer {token}", self._access.users)
+        if user is None:
+            _log.warning("a wrong token was given in the form")
             return _page("The token is wrong.", 401)
+        _log.info("%s: logged in", user.name)
         answer = RedirectResponse("/", 303)
         answer.set_cookie(
             COOKIE, token, httponly=True, samesite="strict",
