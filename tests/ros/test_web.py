@@ -37,6 +37,7 @@ def cluster(make_shared):
 def web(cluster):
     """Return a gateway that only reads."""
     with gateway(cluster.ros) as one:
+        one.wait_for_master("up")
         yield one
 
 

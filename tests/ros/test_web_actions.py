@@ -10,6 +10,7 @@ import pytest
 
 from tests.ros.clusters import host, service
 from tests.ros.web_kit import gateway
+from tests.waiting import wait_until
 
 OPERATOR, VIEWER = "o" * 32, "v" * 32
 QUICK = {"interrupt_grace": "0.5s", "terminate_grace": "0.5s"}
@@ -27,6 +28,10 @@ def web(cluster):
     file.touch(0o600)
     file.write_text(f"operator ada {OPERATOR}\nviewer eve {VIEWER}\n")
     with gateway(cluster.ros, "--tokens", str(file), "--allow-actions") as one:
+        wait_until(
+            lambda: one.ask("/v1/hosts", Authorization=f"Bearer {VIEWER}").status == 200,
+            "the gateway finds the master",
+        )
         yield one
 
 
@@ -137,7 +142,11 @@ def test_the_log_names_who_acted(web, post):
     """A line for each request that acts."""
     post("uncordon", {"host": "robot-1"})
 
-    assert any("ada: POST '/v1/uncordon': 200" in line for line in web.said), web.said
+    wait_until(
+        lambda: any("ada: POST '/v1/uncordon': 200" in line for line in web.said),
+        "the gateway logs the request",
+        seen=lambda: web.said,
+    )
 
 
 def test_tokens_that_others_can_read_are_refused(cluster, web):

@@ -11,7 +11,7 @@ import sys
 import pytest
 
 from tests.ros.clusters import host, job, service
-from tests.ros.web_kit import gateway
+from tests.ros.web_kit import START_PATIENCE, gateway
 from tests.waiting import PATIENCE, wait_until
 
 
@@ -61,14 +61,14 @@ def test_a_scrape_has_the_present_and_the_events_since_the_start(cluster):
 
 def test_the_command_prints_metrics_or_replaces_a_file(cluster, tmp_path):
     """The node exporter, another user, can read the file."""
-    printed, _ = command(cluster).communicate(timeout=PATIENCE)
+    printed, _ = command(cluster).communicate(timeout=START_PATIENCE)
     assert "rosrm_up 1.0" in printed.splitlines()
     assert "rosrm_events_total" not in printed
 
     file = tmp_path / "rosrm.prom"
     process = command(cluster, "--textfile", str(file), "--every", "0.1s")
     try:
-        wait_until(file.exists, "the file is written")
+        wait_until(file.exists, "the file is written", START_PATIENCE)
         before = file.stat().st_ino
         wait_until(lambda: file.stat().st_ino != before, "the file is replaced")
         assert 'rosrm_events_total{kind="finished"}' in file.read_text()
@@ -105,7 +105,7 @@ def test_a_slave_writes_the_metrics_of_its_host(cluster, collected):
 def test_a_wrong_option_is_one_sentence(cluster, words, says):
     """Exit code 2, and nothing is printed."""
     process = command(cluster, *words)
-    out, error = process.communicate(timeout=PATIENCE)
+    out, error = process.communicate(timeout=START_PATIENCE)
 
     assert (process.returncode, out) == (2, "")
     assert error.startswith(f"rosrm: {says}")

@@ -149,7 +149,11 @@ def test_an_invalid_file_of_tokens_keeps_the_former_ones(ros, tmp_path):
         assert is_invalid(b"0.0")
         file.chmod(0o644)
         wait_until(lambda: is_invalid(b"1.0"), "the metric says that the file is invalid")
-        assert any("other users can read or change it" in line for line in web.said)
+        wait_until(
+            lambda: any("other users can read or change it" in line for line in web.said),
+            "the gateway logs the reason",
+            seen=lambda: web.said,
+        )
         file.chmod(0o600)
         wait_until(lambda: is_invalid(b"0.0"), "the file is read again")
 
