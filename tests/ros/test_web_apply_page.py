@@ -92,6 +92,7 @@ def test_a_work_file_is_planned_and_applied(page, cluster, web):
     dialog.get_by_role("cell", name="planner").wait_for()
     assert not cluster.client.list(applications=True).applications
     dialog.get_by_role("button", name="Apply: start 2").click()
+    dialog.get_by_text("Accepted: nav version 1: 2 processes to start").wait_for()
     cluster.wait("planner", "running", application="nav")
     cluster.wait("mapper", "running")
     dialog.get_by_role("button", name="Close").click()

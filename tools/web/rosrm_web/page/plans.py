@@ -100,7 +100,7 @@ class Plan:
             return
         self._area.clear()
         with self._area:
-            for text in (done.message, *notes):
+            for text in (f"Accepted: {done.message}", *notes):
                 ui.label(text).props("role=status")
         names = listed(dict.fromkeys(one.application for one in plan.actions))
         self._on_action(f"{summary(plan.actions)} of {names}")
