@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -153,39 +154,43 @@ def test_the_page_fits_a_phone(chromium, web):
     assert wide <= 390
 
 
-def test_a_token_opens_the_page_and_an_operator_acts(chromium, cluster, tmp_path):
-    """Without a token there is only the form; each action asks once, and says what it will do."""
-    tokens = tmp_path / "tokens"
-    tokens.write_text(f"operator ada {TOKEN}\n")
-    tokens.chmod(0o600)
+@pytest.fixture
+def tokens(tmp_path) -> Path:
+    """Return the file with the tokens of `operated`."""
+    file = tmp_path / "tokens"
+    file.touch(0o600)
+    file.write_text(f"operator ada {TOKEN}\noperator eve {TOKEN[::-1]}\n")
+    return file
+
+
+@pytest.fixture
+def operated(chromium, cluster, tokens):
+    """Yield the page of an operator; without a token there is only the form."""
     with (
         gateway(cluster.ros, "--tokens", str(tokens), "--allow-actions") as web,
         tab(chromium, web.url) as page,
     ):
         page.get_by_label("Token").fill(TOKEN)
         page.get_by_role("button", name="Log in").click()
-        row(page, "robot-2").dblclick()
-        cordoned = page.locator(".ag-row", has_text="up, cordoned")
-        act(page, "Cordon", "robot-2 gets no new processes.")
-        cordoned.wait_for()
-        act(page, "Uncordon", "robot-2 gets new processes again.")
-        cordoned.wait_for(state="detached")
+        row(page, "robot-2").wait_for()
+        yield page
 
 
-def test_the_page_of_an_operator_who_becomes_a_viewer_is_replaced(chromium, cluster, tmp_path):
+def test_an_operator_acts(operated):
+    """Each action asks once, and says what it will do."""
+    row(operated, "robot-2").dblclick()
+    cordoned = operated.locator(".ag-row", has_text="up, cordoned")
+    act(operated, "Cordon", "robot-2 gets no new processes.")
+    cordoned.wait_for()
+    act(operated, "Uncordon", "robot-2 gets new processes again.")
+    cordoned.wait_for(state="detached")
+
+
+def test_the_page_of_an_operator_who_becomes_a_viewer_is_replaced(operated, tokens):
     """The token stays valid, but the buttons of the open page must not act any more."""
-    tokens = tmp_path / "tokens"
-    tokens.write_text(f"operator ada {TOKEN}\noperator eve {TOKEN[::-1]}\n")
-    tokens.chmod(0o600)
-    with (
-        gateway(cluster.ros, "--tokens", str(tokens), "--allow-actions") as web,
-        tab(chromium, web.url) as page,
-    ):
-        page.get_by_label("Token").fill(TOKEN)
-        page.get_by_role("button", name="Log in").click()
-        page.get_by_text("operator", exact=True).wait_for()
-        tokens.write_text(f"viewer ada {TOKEN}\noperator eve {TOKEN[::-1]}\n")
-        page.get_by_text("read-only", exact=True).wait_for()
+    operated.get_by_text("operator", exact=True).wait_for()
+    tokens.write_text(f"viewer ada {TOKEN}\noperator eve {TOKEN[::-1]}\n")
+    operated.get_by_text("read-only", exact=True).wait_for()
 
 
 def act(page: Any, action: str, warning: str) -> None:
