@@ -47,6 +47,8 @@ class Gateway:
         self.watcher = Watcher(self.reading)
         self._listings = Listings(self.reading)
         self.broadcast = Broadcast()
+        # First, so that no reader of an event gets a listing from before it.
+        self.watcher.on_events.append(lambda _: self.forget_listings())
         self.watcher.on_events.append(self.broadcast.send_events)
         self.watcher.on_master.append(lambda master: self.broadcast.send(master_part(master)))
 

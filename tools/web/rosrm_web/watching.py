@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rosrm_web.master_link import MasterLink
 
 #: Seconds between two requests to the master.
-PERIOD: Final = 0.2
+PERIOD: Final = 0.1
 #: Most new events of one request; if there are more, the oldest are left out.
 MOST_EVENTS: Final = 1000
 #: Seconds without an answer after which the master counts as lost.

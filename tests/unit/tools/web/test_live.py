@@ -14,9 +14,14 @@ class Master:
 
     newest = 1
 
-    def list(self, **_):
+    def __init__(self):
+        self.asked = []
+
+    def list(self, **parts):
+        self.asked.append(parts)
         event = EventRow(self.newest, 1.7e9, 1.0, "assigned", "p", "a", "")
-        return Listing("m", 1.0, self.newest, events=[event])
+        processes = ["p"] if parts.get("processes") else []
+        return Listing("m", 1.0, self.newest, processes=processes, events=[event])
 
     def master_load(self):
         """Return nothing: no load was published."""
@@ -69,6 +74,47 @@ def test_nothing_is_read_while_nobody_looks():
         live.leave(live.on_change[0])
         _, still_reading = await asyncio.wait(reading, timeout=30.0)
         assert not still_reading
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_hosts_are_read_more_often_than_processes():
+    """A listing of hosts alone keeps the processes that are known."""
+
+    async def scene() -> None:
+        master = Master()
+        gateway, live = await started(master)
+        hosts_alone = asyncio.Event()
+
+        def look() -> None:
+            parts = master.asked[-1]
+            if parts.get("hosts") and not parts.get("processes"):
+                assert live.listing.processes == ["p"]
+                hosts_alone.set()
+
+        live.join(look)
+        await asyncio.wait_for(hosts_alone.wait(), 30.0)
+        live.leave(look)
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_an_event_makes_older_listings_void():
+    """Otherwise a page would show the state from before the event for a second."""
+
+    async def scene() -> None:
+        master = Master()
+        gateway, _ = await started(master)
+        await gateway.list(hosts=True)
+        before = len(master.asked)
+        await gateway.list(hosts=True)
+        assert len(master.asked) == before  # the same listing again
+
+        await gateway.watcher.look()
+        await gateway.list(hosts=True)
+        assert master.asked[-1]["hosts"]
         gateway.close()
 
     asyncio.run(scene())

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from rosrm.errors import RosrmError
@@ -17,8 +19,10 @@ if TYPE_CHECKING:
     from rosrm.model.rows import EventRow, Listing
     from rosrm_web.gateway import Gateway
 
-#: Seconds between two listings without an event.
+#: Seconds between two listings of the hosts without an event.
 PERIOD: Final = 1.0
+#: Likewise of everything: thousands of processes take much longer.
+WHOLE_PERIOD: Final = 2.0
 #: Events that a new page shows.
 MOST_EVENTS: Final = 500
 
@@ -40,6 +44,7 @@ class Live:
     def __init__(self, gateway: Gateway) -> None:
         self._gateway = gateway
         self._woken = asyncio.Event()
+        self._whole_at = 0.0
         self.listing: Listing | None = None
         self.applications: Listing | None = None
         self.readers_of_applications: set[Callable[[], None]] = set()
@@ -74,15 +79,23 @@ class Live:
         while True:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._woken.wait(), PERIOD)
+            is_due = self._woken.is_set() or time.monotonic() >= self._whole_at
             self._woken.clear()
-            await self._read()
+            await (self._read() if is_due else self._read_hosts())
             for call in list(self.on_change):
                 try:
                     call()
                 except Exception:  # noqa: BLE001 - one browser must not stop the others
                     _log.exception("the page of a browser cannot be updated")
 
+    async def _read_hosts(self) -> None:
+        with suppress(RosrmError):  # the watcher has the state of the master
+            hosts = await self._gateway.list(hosts=True)
+            if self.listing is not None:
+                self.listing = replace(self.listing, hosts=hosts.hosts, uptime=hosts.uptime)
+
     async def _read(self) -> None:
+        self._whole_at = time.monotonic() + WHOLE_PERIOD
         try:
             if self.readers_of_applications:
                 self.listing = self.applications = await self._gateway.list(
