@@ -121,7 +121,7 @@ def test_the_summary_of_nothing():
 def test_the_picture_is_drawn(record, tmp_path):
     draw_usage(tmp_path / "usage.png", record, title_of(record))
     assert (tmp_path / "usage.png").read_bytes().startswith(b"\x89PNG")
-    assert title_of(record) == "2 processes on 2 hosts of 0 MiB, 1 migrations"
+    assert title_of(record) == "2 processes on 2 hosts of 0 MiB, migrations: 1"
 
 
 def test_it_is_drawn_anew_from_the_files(record, tmp_path, capsys):
