@@ -25,7 +25,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
 @pytest.mark.slow
 @pytest.mark.timeout(240)
 def test_a_short_demo_fills_the_hosts_maps_the_drive_and_migrates(start: Start) -> None:
-    run = start("--drive", "street:36", "--pieces", "3", "--pace", "3")
+    run = start("--drive", "street:36", "--pieces", "3", "--pace", "2")
     status, output, errors = run.end(seconds=180.0)
     assert (status, errors) == (0, ""), output
     run.check_clean()
