@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gzip
-import struct
 import zlib
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -14,8 +13,8 @@ from typing import Final
 from rosrm.archive.layout import Segment, Source, read_segments
 from rosrm.errors import Refused
 from rosrm.model.rows import LogPart
+from rosrm.supervisor import log_index
 
-_RECORD: Final = struct.Struct("<dQQ")
 #: Most bytes of a file that are read: a segment is smaller, unless it is damaged.
 _MOST: Final = 64 << 20
 #: Longest difference (s) between the clocks of a host and of the collector.
@@ -84,7 +83,7 @@ class LogArchive:
                 return self._part(source, offset, max_bytes or _PART, tail, since)
             except FileNotFoundError:  # closed or removed just now
                 self._read_directory()
-            except (OSError, EOFError, zlib.error, struct.error) as error:
+            except (OSError, EOFError, zlib.error) as error:
                 raise Refused(
                     f"{process}: its log in {self.directory} cannot be read: {error}"
                 ) from None
@@ -132,9 +131,8 @@ class LogArchive:
             records = _bytes_of(segment.times)
         except FileNotFoundError:
             records = b""
-        records = records[: len(records) // _RECORD.size * _RECORD.size]
         shift = begin - segment.begin
-        marks = [(time, at + shift, pid) for time, at, pid in _RECORD.iter_unpack(records)]
+        marks = [(time, at + shift, pid) for time, at, pid in log_index.marks_in(records)]
         found = _Content(content, begin, marks)
         if not segment.is_open:
             self._loaded = segment.path, found

@@ -28,9 +28,7 @@ def excess(
 ) -> list[tuple[Source, Segment]]:
     """Return the closed segments to remove: the oldest of a host beyond its bound, then of all."""
     stored = list(stored)
-    host_rooms: Counter[str] = Counter()
-    for source, segment in stored:
-        host_rooms[source.host] += segment.room
+    host_rooms = _host_rooms(stored)
     room, removed = sum(host_rooms.values()), []
     closed = sorted((one for one in stored if not one[1].is_open), key=lambda one: one[1].time)
     staying = []
@@ -53,8 +51,13 @@ def excess(
 
 def is_within(stored: Iterable[tuple[Source, Segment]], limits: ArchiveLimits) -> bool:
     """Return True if an archive exceeds none of its bounds."""
-    host_rooms: Counter[str] = Counter()
+    rooms = _host_rooms(stored).values()
+    return sum(rooms) <= limits.keep and max(rooms, default=0) <= limits.keep_host
+
+
+def _host_rooms(stored: Iterable[tuple[Source, Segment]]) -> Counter[str]:
+    """Return the bytes on the disk of each host."""
+    rooms: Counter[str] = Counter()
     for source, segment in stored:
-        host_rooms[source.host] += segment.room
-    fullest = max(host_rooms.values(), default=0)
-    return sum(host_rooms.values()) <= limits.keep and fullest <= limits.keep_host
+        rooms[source.host] += segment.room
+    return rooms

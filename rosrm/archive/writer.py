@@ -8,7 +8,6 @@ again that were not written.
 from __future__ import annotations
 
 import gzip
-import math
 import os
 import zlib
 from collections.abc import Iterable, Iterator
@@ -26,7 +25,8 @@ from rosrm.archive.layout import (
 )
 from rosrm.archive.retention import ArchiveLimits, excess, is_within
 from rosrm.model.rows import LogPart
-from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.runtime import atomic_file
+from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.supervisor import log_index
 from rosrm.supervisor.log_index import Mark
 
@@ -36,8 +36,6 @@ SEGMENT_BYTES: Final = 4 << 20
 _EXCESS_PART: Final = 64
 #: Empty segments, which remember the positions of sources whose logs were removed.
 _MOST_EMPTY: Final = 100_000
-#: Unix time before which times of marks are (year 2242).
-_LATEST: Final = float(1 << 33)
 
 
 class ArchiveWriter:
@@ -217,9 +215,7 @@ class ArchiveWriter:
 def _append(path: Path, content: bytes) -> None:
     file = open_private(str(path), os.O_WRONLY | os.O_APPEND)
     try:
-        view = memoryview(content)
-        while view:
-            view = view[os.write(file, view) :]
+        write_all(file, content)
     finally:
         os.close(file)
 
@@ -242,7 +238,7 @@ def _add_marks(segment: Segment, part: LogPart) -> None:
 def _sane(marks: Iterable[tuple[float, int, int]], begin: int, end: int) -> Iterator[Mark]:
     """Yield the marks that can be true; the first one behind the part counts as its end."""
     for time, offset, pid in marks:
-        if not (math.isfinite(time) and 0.0 < time < _LATEST and 0 <= pid < 1 << 63):
+        if not (log_index.is_possible(time) and 0 <= pid < 1 << 63):
             continue
         if offset > end:
             yield Mark(time, end, 0)
@@ -253,21 +249,12 @@ def _sane(marks: Iterable[tuple[float, int, int]], begin: int, end: int) -> Iter
 
 def _compress(source: Path, target: Path) -> None:
     """Write a compressed copy of a file; the copy appears when it is complete."""
-    new = target.with_name(f"{target.name}.new")
     try:
         content = source.read_bytes()
     except FileNotFoundError:
         content = b""
-    try:
-        file = open_private(str(new), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        with os.fdopen(file, "wb") as out:
-            out.write(gzip.compress(content, 6, mtime=0))
-            out.flush()
-            os.fsync(out.fileno())
-        new.replace(target)
-    except OSError:
-        new.unlink(missing_ok=True)
-        raise
+    compressed = gzip.compress(content, 6, mtime=0)
+    os.close(atomic_file.replace(str(target), compressed, is_durable=True))
 
 
 def _remove(segment: Segment) -> None:

@@ -23,7 +23,7 @@ from rosrm.errors import Refused, TransferError
 from rosrm.model.artifacts import Artifact, set_key
 from rosrm.model.placeholders import ARTIFACTS
 from rosrm.runtime.disk_space import room_for
-from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.wording import size as sized
 
 #: Bytes of the disk that stay free.
@@ -61,9 +61,7 @@ class Incoming:
     def write(self, data: bytes) -> None:
         """Append a part; raises `Refused`."""
         try:
-            view = memoryview(data)
-            while view:
-                view = view[os.write(self._file, view) :]
+            write_all(self._file, data)
         except OSError as error:
             raise _unwritable(self.artifact, self.path, error) from None
         self._digest.update(data)

@@ -14,7 +14,7 @@ from typing import Any, Final
 from rosrm.errors import Refused
 from rosrm.model.artifacts import LARGEST_ARTIFACT, is_digest
 from rosrm.runtime.disk_space import room_for
-from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.wording import size as sized
 
 #: Seconds for which contents stay that no process refers to, because their processes are about to
@@ -159,9 +159,7 @@ class ArtifactStore:
             self._end((sender, digest))
             raise _changed(digest)
         try:
-            view = memoryview(data)
-            while view:
-                view = view[os.write(upload.file, view) :]
+            write_all(upload.file, data)
         except OSError as error:
             self._end((sender, digest))
             raise _unwritable(upload.path, error) from None

@@ -5,13 +5,15 @@ from __future__ import annotations
 import os
 from typing import Final
 
-from rosrm.runtime.private_files import open_private
+from rosrm.runtime.private_files import open_private, write_all
 
 #: Mode that `open_private` gives.
 _PRIVATE: Final = 0o600
 
 
-def replace(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> int:
+def replace(
+    path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE, *, is_durable: bool = False
+) -> int:
     """Replace a file by a new one, and return the open descriptor of the new one.
 
     After a failure the old file is unchanged, and no part of the new content is left: it would
@@ -22,6 +24,7 @@ def replace(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> 
         content: of the new file.
         flags: further flags of its descriptor.
         mode: of the new file.
+        is_durable: the new file is on the disk before it replaces the old one.
 
     Raises:
         OSError: the file cannot be written.
@@ -31,9 +34,9 @@ def replace(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> 
     try:
         if mode != _PRIVATE:
             os.fchmod(file, mode)
-        view = memoryview(content)
-        while view:
-            view = view[os.write(file, view) :]
+        write_all(file, content)
+        if is_durable:
+            os.fsync(file)
         os.replace(new, path)
     except OSError:
         os.close(file)

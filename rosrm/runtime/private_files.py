@@ -125,6 +125,17 @@ def open_own(path: str, flags: int) -> tuple[int, int]:
     return file, stat.S_IMODE(state.st_mode)
 
 
+def write_all(file: int, content: bytes) -> None:
+    """Write bytes to a descriptor, as one call of `os.write` may write only a part of them.
+
+    Raises:
+        OSError: the disk is full, for example; a part may have been written.
+    """
+    view = memoryview(content)
+    while view:
+        view = view[os.write(file, view) :]
+
+
 def make_private_file(path: str) -> None:
     """Tighten the mode of a file in a private directory to 0600; a missing file is no error.
 

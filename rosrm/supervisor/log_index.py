@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 _RECORD: Final = struct.Struct("<dQQ")
+#: Unix time before which times of output are (year 2242).
+_LATEST: Final = float(1 << 33)
 
 
 class Mark(NamedTuple):
@@ -32,6 +34,17 @@ class Mark(NamedTuple):
     time: float
     offset: int
     pid: int
+
+
+def is_possible(time: float) -> bool:
+    """Return True if a unix time can be one of a log; other hosts may send any, also NaN."""
+    return 0.0 < time < _LATEST
+
+
+def marks_in(content: bytes) -> list[Mark]:
+    """Return the records in bytes of an index file; an incomplete last one is left out."""
+    whole = len(content) // _RECORD.size * _RECORD.size
+    return [Mark(*record) for record in _RECORD.iter_unpack(content[:whole])]
 
 
 def path_of(log: str) -> str:
@@ -123,5 +136,4 @@ class Index:
         most = min(most, self.count - first)
         if most <= 0:
             return []
-        part = os.pread(self._file, most * _RECORD.size, first * _RECORD.size)
-        return [Mark(*record) for record in _RECORD.iter_unpack(part)]
+        return marks_in(os.pread(self._file, most * _RECORD.size, first * _RECORD.size))
