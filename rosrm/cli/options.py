@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, Final
 
 import typer
 
@@ -38,12 +38,11 @@ Name = Annotated[
     str,
     typer.Argument(metavar="NAME", help="Name of a process.", autocompletion=completion.processes),
 ]
-Names = Annotated[
-    list[str],
-    typer.Argument(
-        metavar="NAME...", help="Names of processes.", autocompletion=completion.processes
-    ),
-]
+_NAMES: Final = typer.Argument(
+    metavar="NAME...", help="Names of processes.", autocompletion=completion.processes
+)
+Names = Annotated[list[str], _NAMES]
+SomeNames = Annotated[list[str] | None, _NAMES]
 Array = Annotated[
     str, typer.Option("--array", metavar="NAME", help="Only jobs of this array, e.g. render.")
 ]
@@ -60,6 +59,11 @@ Host = Annotated[
     str,
     typer.Argument(metavar="HOST", help="Name of a host.", autocompletion=completion.hosts),
 ]
+
+
+def host_option(effect: str) -> Any:
+    """Return the option --host of a command that it narrows; the effect is its help."""
+    return typer.Option("--host", metavar="HOST", help=effect, autocompletion=completion.hosts)
 
 
 def seconds_of(

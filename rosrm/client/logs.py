@@ -222,7 +222,7 @@ class LogReader:
             if host not in self._away:
                 must_answer = host == owner and host not in collected
                 found += [(host, number) for number in self._numbers(host, must_answer)]
-        for host in collected if self.archive is not None else ():
+        for host in collected:
             found += self._find_collected(host, found)
         for host, away in self._away.items():
             if host not in collected:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 import typer
 
 from rosrm.cli import completion, connection
-from rosrm.cli.options import AsJson, Domain, seconds_of
+from rosrm.cli.options import AsJson, Domain, host_option, seconds_of
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 from rosrm.wording import counted
@@ -41,15 +41,7 @@ def events(  # noqa: PLR0917 - an argument for each option
             autocompletion=completion.processes,
         ),
     ] = "",
-    host: Annotated[
-        str,
-        typer.Option(
-            "--host",
-            metavar="HOST",
-            help="Show only events of this host.",
-            autocompletion=completion.hosts,
-        ),
-    ] = "",
+    host: Annotated[str, host_option("Show only events of this host.")] = "",
     newest: Annotated[
         int | None,
         typer.Option(

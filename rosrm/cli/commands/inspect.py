@@ -9,8 +9,8 @@ from typing import Annotated, Final
 
 import typer
 
-from rosrm.cli import completion, connection
-from rosrm.cli.options import Application, Array, AsJson, Domain, Name
+from rosrm.cli import connection
+from rosrm.cli.options import Application, Array, AsJson, Domain, Name, host_option
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
 
@@ -35,15 +35,7 @@ def ps(  # noqa: PLR0917 - an argument for each option
     everything: Annotated[
         bool, typer.Option("--all", "-a", help="List finished and cancelled processes too.")
     ] = False,
-    host: Annotated[
-        str,
-        typer.Option(
-            "--host",
-            metavar="HOST",
-            help="List only processes on this host.",
-            autocompletion=completion.hosts,
-        ),
-    ] = "",
+    host: Annotated[str, host_option("List only processes on this host.")] = "",
     array: Array = "",
     application: Application = "",
     as_json: AsJson = False,

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Final, cast
 
 import typer
 
-from rosrm.cli import completion, connection
-from rosrm.cli.options import Application, CommonOptions, Domain
+from rosrm.cli import connection
+from rosrm.cli.options import Application, CommonOptions, Domain, SomeNames, host_option
 from rosrm.errors import ConfigError, Refused
 
 if TYPE_CHECKING:
@@ -39,12 +39,7 @@ Archive = Annotated[
 
 def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
     ctx: typer.Context,
-    names: Annotated[
-        list[str] | None,
-        typer.Argument(
-            metavar="NAME...", help="Names of processes.", autocompletion=completion.processes
-        ),
-    ] = None,
+    names: SomeNames = None,
     app: Application = "",
     follow: Annotated[
         bool,
@@ -90,15 +85,7 @@ def logs(  # noqa: PLR0913, PLR0917 - an argument for each option
             "--timestamps", "-t", help="Begin each line with its time, by the clock of its host."
         ),
     ] = False,
-    host: Annotated[
-        str,
-        typer.Option(
-            "--host",
-            metavar="HOST",
-            help="Print only output from this host.",
-            autocompletion=completion.hosts,
-        ),
-    ] = "",
+    host: Annotated[str, host_option("Print only output from this host.")] = "",
     raw: Annotated[
         bool,
         typer.Option("--raw", help="Print colours and other control characters in a terminal too."),

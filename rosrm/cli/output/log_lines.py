@@ -13,8 +13,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from rosrm.cli.output.log_levels import Level
 from rosrm.cli.output.log_search import LineContext, LineSearch, coloured, is_shown, json_line
 from rosrm.client.logs import LogChunk
+from rosrm.supervisor import log_index
 from rosrm.wording import printable, size
 
 Marks = Sequence[tuple[float, int, int]]
@@ -22,8 +24,6 @@ Marks = Sequence[tuple[float, int, int]]
 Piece = tuple[float, bytes]
 #: Bytes after which an endless line is divided.
 _LONGEST_LINE: Final = 1 << 16
-#: Unix time before which times of output are (year 2242).
-_LATEST: Final = float(1 << 33)
 
 
 def show(pieces: Iterable[Piece]) -> None:
@@ -78,8 +78,7 @@ class LogStream:
     def write(self, chunk: LogChunk) -> None:
         """Add bytes of the process."""
         content, offset = chunk.content, chunk.offset
-        # Times come from other hosts, and may be NaN.
-        marks = [mark for mark in chunk.marks if 0.0 < mark[0] < _LATEST]
+        marks = [mark for mark in chunk.marks if log_index.is_possible(mark[0])]
         if chunk.is_first:
             self.close()
             self._host, self._number, self._is_new = chunk.host, chunk.number, self.wrote
@@ -147,15 +146,16 @@ class LogStream:
             self._pieces.append((context.time, form.encode()))
             return
         stamp = f"{_stamp(context.time)} ".encode() if self.timestamps else b""
-        self._add(self.prefix + stamp + line, context.time)
-        if search is not None and search.coloured:
-            time, shown = self._pieces[-1]
-            self._pieces[-1] = time, coloured(shown.decode(), context.level).encode()
+        level = context.level if search is not None and search.coloured else None
+        self._add(self.prefix + stamp + line, context.time, level)
 
-    def _add(self, text: bytes, when: float = 0.0) -> None:
+    def _add(self, text: bytes, when: float = 0.0, level: Level | None = None) -> None:
+        """Add a piece, in the colour of a level if one is given."""
         if not self.raw:  # a character may be divided between two pieces
             shown = self._decoder.decode(text).replace("\r\n", "\n")
             text = printable(shown).encode()
+        if level is not None:
+            text = coloured(text.decode(), level).encode()
         self._pieces.append((when, text))
         self._at_line_start = text.endswith(b"\n")
 

@@ -90,9 +90,9 @@ def is_shown(line: str, context: LineContext, search: LineSearch) -> bool:
     return search.pattern is None or search.pattern.search(line.rstrip("\r\n")) is not None
 
 
-def coloured(line: str, level: Level | None) -> str:
+def coloured(line: str, level: Level) -> str:
     """Return a line in the colour of its level."""
-    colour = _COLOURS.get(level) if level is not None else None
+    colour = _COLOURS.get(level)
     if colour is None:
         return line
     text = line.rstrip("\n")
