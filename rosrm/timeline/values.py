@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal
 
 #: State of a process at the end of the timeline.
 Outcome = Literal["finished", "failed", "cancelled", "running", "waiting"]
+
+
+#: What a host is while it is gone.
+GONE: Final = ("lost", "left", "detached")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,3 +119,14 @@ class HostSpan:
     what: str
     begin: float
     end: float
+
+    @property
+    def is_gone(self) -> bool:
+        """Return True if the host was gone, and not over a limit."""
+        return self.what in GONE
+
+    @property
+    def phrase(self) -> str:
+        """Return "HOST is lost", or "HOST is over its limit of RESOURCE"."""
+        predicate = self.what if self.is_gone else f"over its limit of {self.what}"
+        return f"{self.host} is {predicate}"

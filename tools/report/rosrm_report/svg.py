@@ -9,7 +9,7 @@ from typing import Final
 
 from rosrm.timeline.lanes import lanes
 from rosrm.timeline.values import Failure, HostSpan, Move, Placement
-from rosrm.wording import duration, sanitized
+from rosrm.wording import duration, sanitized, words
 from rosrm_report.model import Readings
 
 #: Number of colours in page.css.
@@ -149,7 +149,7 @@ def timeline(
 
 def _bar(scale: _Scale, one: Placement, y: float, colour: int) -> str:
     x, width = scale(one.begin), max(scale(one.end) - scale(one.begin), 1.0)
-    ended = f", then {one.ended_by.replace('_', ' ')}" if one.ended_by else ""
+    ended = f", then {words(one.ended_by)}" if one.ended_by else ""
     tip = _tip(
         f"{one.process} on {one.host}: {clock(one.begin)} to {clock(one.end)} "
         f"({duration(one.end - one.begin)}){ended}"
@@ -164,14 +164,13 @@ def _bar(scale: _Scale, one: Placement, y: float, colour: int) -> str:
 
 
 def _span(scale: _Scale, one: HostSpan, y: float, height: float) -> str:
-    gone = one.what in ("lost", "left", "detached")
+    gone = one.is_gone
     x, width = scale(one.begin), max(scale(one.end) - scale(one.begin), 1.0)
-    what = f"is {one.what}" if gone else f"is over its limit of {one.what}"
     times = f"{clock(one.begin)} to {clock(one.end)}"
     place = f'y="{y}" height="{height}"' if gone else f'y="{y + height + 1}" height="3"'
     return (
         f'<rect class="{"gone" if gone else "over"}" x="{x}" width="{width:.1f}" {place}>'
-        f"{_tip(f'{one.host} {what}: {times}')}</rect>"
+        f"{_tip(f'{one.phrase}: {times}')}</rect>"
     )
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
@@ -77,14 +78,11 @@ class Dialog:
         with ui.dialog() as self.dialog:
             self.card = ui.card().classes("w-full max-w-screen-lg")
         self._question = Question()
-        with self.card, ui.row().classes("w-full items-center"):
-            self._title = title_of(self.dialog)
-            ui.space()
+        with self.card, heading(self.dialog) as self._title:
             for action in actions:
                 ui.button(action.title, color=None, on_click=partial(self._confirm, action)).props(
                     "outline no-caps"
                 )
-            ui.button("Close", color=None, on_click=self.dialog.close).props("flat no-caps")
 
     def open(self, name: str) -> None:
         """Show the process or host of this name."""
@@ -105,11 +103,15 @@ class Dialog:
         self._on_action(f"{action.title.lower()} {name}")
 
 
-def title_of(dialog: ui.dialog) -> ui.label:
-    """Add a heading that names a dialog."""
-    title = ui.label().classes("text-h6").props("role=heading aria-level=2")
-    dialog.props(f"aria-labelledby={title.html_id}")
-    return title
+@contextmanager
+def heading(dialog: ui.dialog) -> Iterator[ui.label]:
+    """Add a row with a title that names a dialog, the buttons that the caller adds, and Close."""
+    with ui.row().classes("w-full items-center"):
+        title = ui.label().classes("text-h6").props("role=heading aria-level=2")
+        dialog.props(f"aria-labelledby={title.html_id}")
+        ui.space()
+        yield title
+        ui.button("Close", color=None, on_click=dialog.close).props("flat no-caps")
 
 
 class Question:
@@ -162,15 +164,16 @@ class HostDialog(Dialog):
             with self._body:
                 labels = [f"{key}={value}" for key, value in row.description.labels.items()]
                 ui.label(f"Labels: {', '.join(labels) or 'none'}")
-                show_table(("device", "state", "about"), list(map(_device, row.devices)), "Devices")
+                show_table(("device", "state", "about"), map(_device, row.devices), "Devices")
 
 
-def _device(row: DeviceRow) -> dict[str, str]:
+def _device(row: DeviceRow) -> tuple[str, str, str]:
+    """Return title, state and description of a device."""
     held = f"held by {listed(row.holders)}" if row.holders else ""
     free = "free" if row.free >= 1.0 else f"{percent(row.free)} % free" if row.free > 0.0 else ""
     missing = f"missing: {row.missing}" if row.missing else ""
     state = missing or ", ".join(filter(None, (free, held)))
-    return {"device": row.title, "state": state, "about": row.about}
+    return row.title, state, row.about
 
 
 class ProcessDialog(Dialog):
@@ -225,21 +228,20 @@ def _show_explanation(explanation: Mapping[str, Any]) -> None:
     if decision:
         ui.label(explain.sentence(explanation["process"], decision).plain)
         ui.label(explain.needs(decision.get("need") or {}).plain)
-        cells = [dict(zip(_SCORES, one, strict=True)) for one in explain.host_cells(decision)]
-        show_table(_SCORES, cells, "Scores of the hosts, the lowest wins")
-    history = [
-        {"ago": duration(one["elapsed"]), "kind": one["kind"], "message": one["message"]}
+        show_table(_SCORES, explain.host_cells(decision), "Scores of the hosts, the lowest wins")
+    history = (
+        (duration(one["elapsed"]), one["kind"], one["message"])
         for one in explanation.get("history") or ()
-    ]
+    )
     show_table(("ago", "kind", "message"), history, "History")
 
 
-def show_table(names: Sequence[str], cells: list[dict[str, str]], title: str) -> None:
-    """Show cells with text as a small table."""
+def show_table(names: Sequence[str], lines: Iterable[Sequence[str]], title: str) -> None:
+    """Show lines of text, with a cell for each name, as a small table."""
     columns = [
         {"name": name, "label": name.capitalize(), "field": name, "align": "left"} for name in names
     ]
-    rows = [{**row, "id": str(number)} for number, row in enumerate(cells)]
+    rows = [{**dict(zip(names, line, strict=True)), "id": str(at)} for at, line in enumerate(lines)]
     table = ui.table(columns=columns, rows=rows, row_key="id", title=title)
     table.classes("w-full").props("dense flat wrap-cells")
 

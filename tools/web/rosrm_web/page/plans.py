@@ -15,7 +15,7 @@ from rosrm.errors import ConfigError, RosrmError
 from rosrm.model.applications import ApplicationRow, ApplyResult, Target
 from rosrm.wording import listed
 from rosrm_web.acting import checked_work_file, require_application
-from rosrm_web.page.dialogs import Question, show_table, title_of
+from rosrm_web.page.dialogs import Question, heading, show_table
 from rosrm_web.page.plan_rows import interruptions, summary
 
 if TYPE_CHECKING:
@@ -80,8 +80,7 @@ class Plan:
         with self._area:
             ui.label(plan.message)
             if plan.actions:
-                cells = map(applications.action_cells, plan.actions)
-                show_table(_ACTION, [dict(zip(_ACTION, one, strict=True)) for one in cells], "Plan")
+                show_table(_ACTION, map(applications.action_cells, plan.actions), "Plan")
                 begin = partial(self._begin, request, plan)
                 ui.button(f"Apply: {summary(plan.actions)}", on_click=begin).props("no-caps")
 
@@ -114,10 +113,8 @@ class _ChangeDialog:
 
     def __init__(self, gateway: Gateway, on_action: Callable[[str], None]) -> None:
         with ui.dialog() as self.dialog, ui.card().classes("w-full max-w-screen-lg"):
-            with ui.row().classes("w-full items-center"):
-                self.title = title_of(self.dialog)
-                ui.space()
-                ui.button("Close", color=None, on_click=self.dialog.close).props("flat no-caps")
+            with heading(self.dialog) as self.title:
+                pass  # no further buttons
             self.body = ui.column().classes("w-full")
             self.plan = Plan(gateway, on_action)
 
@@ -169,11 +166,8 @@ class ApplicationDialog(_ChangeDialog):
         self.title.text = row.name
         self.plan.clear()
         self.body.clear()
-        cells = [
-            dict(zip(_VERSION, one, strict=True)) for one in applications.version_cells(row)
-        ]  # fmt: skip
         with self.body:
-            show_table(_VERSION, cells, "Versions")
+            show_table(_VERSION, applications.version_cells(row), "Versions")
             if self._may_act:
                 self._show_buttons(row)
         self.dialog.open()

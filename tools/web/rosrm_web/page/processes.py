@@ -98,6 +98,8 @@ class Processes:
 
     def show(self, processes: Sequence[ProcessRow]) -> None:
         """Show a newer listing."""
+        if processes is self._rows:
+            return  # only the hosts were read again
         if self._rows is None:
             self._unsearched.default = len(processes) <= MOST_OPEN
         self._rows = processes

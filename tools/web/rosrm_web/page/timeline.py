@@ -11,7 +11,7 @@ from rosrm.model.rows import Listing, ProcessRow
 from rosrm.timeline.lanes import lanes
 from rosrm.timeline.reading import Timeline
 from rosrm.timeline.values import Failure, HostSpan, Move, Placement
-from rosrm.wording import counted, first_line, sanitized
+from rosrm.wording import counted, first_line, sanitized, words
 from rosrm_web.page.rows import Row
 
 #: Bars of a picture; of more, the longest are drawn.
@@ -118,9 +118,8 @@ class _Drawing:
         made.failures = [
             self._failure(one) for one in failures[-MOST_MARKS:] if one.host in self._bands
         ]
-        made.spans += [self._span(one, is_gone=True) for one in gone[-MOST_MARKS:]]
-        made.spans += [self._span(one, is_gone=False) for one in over[-MOST_MARKS:]]
-        made.table = self._table(moves, failures, gone, over)
+        made.spans = list(map(self._span, [*gone[-MOST_MARKS:], *over[-MOST_MARKS:]]))
+        made.table = self._table(moves, failures, [*gone, *over])
         parts = [
             counted(len(self._bands), "host"),
             counted(len({one.process for _, one in shown}), "process", "processes"),
@@ -210,7 +209,7 @@ class _Drawing:
             style, text = self._present(self._processes.get(one.process))
         else:
             style = _FAILED if one.ended_by == "failed" else _ENDED
-            text = one.ended_by.replace("_", " ")
+            text = words(one.ended_by)
         self._made.bars.append(
             (self._ms(one.begin), self._ms(one.end), row, style, one.process,
              f"on {one.host}: {text}")
@@ -220,7 +219,7 @@ class _Drawing:
     def _present(row: ProcessRow | None) -> tuple[int, str]:
         if row is None:
             return _ENDED, "removed"
-        return _STATES.get(row.state, _ENDED), row.state.replace("_", " ")
+        return _STATES.get(row.state, _ENDED), words(row.state)
 
     def _move(self, one: Move) -> Shape:
         source, destination = (
@@ -239,10 +238,10 @@ class _Drawing:
         begun = [one for one in self._rows.get((process, host), ()) if one[0] <= time]
         return max(begun)[1] if begun else self._bands[host][0]
 
-    def _span(self, one: HostSpan, *, is_gone: bool) -> Shape:
+    def _span(self, one: HostSpan) -> Shape:
         top, count = self._bands[one.host]
-        place = (top, count) if is_gone else (top + count, 0)
-        return (self._ms(one.begin), self._ms(one.end), *place, "", _spoken(one, is_gone=is_gone))
+        place = (top, count) if one.is_gone else (top + count, 0)
+        return (self._ms(one.begin), self._ms(one.end), *place, "", one.phrase)
 
     def _ms(self, seconds: float) -> int:
         if seconds == math.inf:
@@ -252,22 +251,21 @@ class _Drawing:
     # --- the same as text ----------------------------------------------------------------
 
     def _table(
-        self, moves: Iterable[Move], failures: Iterable[Failure], gone: Iterable[HostSpan],
-        over: Iterable[HostSpan],
-    ) -> dict[str, Row]:  # fmt: skip
+        self, moves: Iterable[Move], failures: Iterable[Failure], spans: Iterable[HostSpan]
+    ) -> dict[str, Row]:
         found: list[tuple[float, str, str, str, str]] = [
             (one.time, "moved" if one.done else "stayed", one.process,
              f"{one.source} to {one.destination}", f"{one.how}: {one.cause}")
             for one in moves
         ]  # fmt: skip
         found += [
+            (one.begin, one.what if one.is_gone else "over limit", "", one.host, one.phrase)
+            for one in spans
+        ]
+        found += [
             (one.time, "restarts" if one.restarts else "failed", one.process, one.host, one.message)
             for one in failures
         ]
-        for is_gone, spans in ((True, gone), (False, over)):
-            for one in spans:
-                text = _spoken(one, is_gone=is_gone)
-                found.append((one.begin, one.what if is_gone else "over limit", "", one.host, text))
         found.sort()
         return dict(map(self._text, found[-MOST_ROWS:]))
 
@@ -278,8 +276,3 @@ class _Drawing:
             "id": key, "time": self._ms(time) / 1e3, "what": what, "process": process,
             "host": host, "message": sanitized(first_line(message)),
         }  # fmt: skip
-
-
-def _spoken(one: HostSpan, *, is_gone: bool) -> str:
-    what = f"is {one.what}" if is_gone else f"is over its limit of {one.what}"
-    return f"{one.host} {what}"

@@ -29,10 +29,7 @@ STYLE: Final = f"""
 {timeline_chart.style()}
 """
 _MARKS: Final = (
-    {
-        **views.column("time", width=120, sort="desc"),
-        ":valueFormatter": "params => new Date(params.value * 1000).toLocaleTimeString()",
-    },
+    views.time_column(sort="desc"),
     views.column("what", width=110),
     views.column("process", width=180),
     views.column("host", width=180),

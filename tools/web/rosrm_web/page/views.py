@@ -46,6 +46,14 @@ def usage(name: str, title: str = "") -> dict[str, Any]:
     return {**column(name, title, width=150), ":cellStyle": style}
 
 
+def time_column(**options: Any) -> dict[str, Any]:
+    """Return a column with a unix time as a time of day."""
+    return {
+        **column("time", width=120, **options),
+        ":valueFormatter": "params => new Date(params.value * 1000).toLocaleTimeString()",
+    }
+
+
 HOSTS: Final = (
     column("host", width=150, sort="asc"),
     STATE,
@@ -59,10 +67,7 @@ HOSTS: Final = (
 )
 EVENTS: Final = (
     column("sequence", "Number", width=100, sort="desc"),
-    {
-        **column("time", width=120),
-        ":valueFormatter": "params => new Date(params.value * 1000).toLocaleTimeString()",
-    },
+    time_column(),
     column("kind", width=170),
     column("process", width=160),
     column("host", width=130),
