@@ -85,7 +85,7 @@ fuzz: setup ## hostile input with random seeds for a while: make fuzz MINUTES=60
 	@$(BIN)/python scripts/fuzz.py --minutes "$(or $(MINUTES),60)"
 
 screenshots: setup ## the pictures of the page in the docs, taken while a demo runs (Chromium)
-	@$(BIN)/python scripts/screenshots.py
+	@$(BIN)/python -m scripts.screenshots
 
 evaluation: setup ## the paper's figures and table, on virtual hosts: out/evaluation/ (root, 40 minutes)
 	@$(BIN)/python -m benchmarks.paper all --out "$(or $(OUT),out/evaluation)"

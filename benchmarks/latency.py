@@ -17,6 +17,7 @@ import numpy as np
 
 from benchmarks.hosts import three_hosts
 from benchmarks.machine import parser, print_report
+from benchmarks.peers.work import STAMP
 from benchmarks.stopping import run
 from rosrm.errors import Refused
 from rosrm.model.values import Kind, ProcessSpec
@@ -24,7 +25,6 @@ from rosrm.slave.logs import newest_instance
 from rosrm.supervisor.client import log_path
 from rosrm.testing.local_cluster import LocalCluster
 
-_STAMP = ("date", "+%s%N")
 _NS_PER_MS = 1e6
 
 
@@ -34,7 +34,7 @@ def bare_spawn_ms(folder: Path) -> float:
     with out.open("wb") as sink:
         called = time.time_ns()
         process = subprocess.Popen(
-            _STAMP, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True
+            STAMP, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True
         )
     process.wait(10.0)
     return (int(out.read_text()) - called) / _NS_PER_MS
@@ -44,7 +44,7 @@ def submitted_ms(cluster: LocalCluster, number: int) -> float:
     """Return the milliseconds from the call of `submit` to the stamp of the process."""
     name = f"stamp{number}"
     called = time.time_ns()
-    cluster.client.submit([ProcessSpec(name, command=_STAMP, kind=Kind.JOB)])
+    cluster.client.submit([ProcessSpec(name, command=STAMP, kind=Kind.JOB)])
     _wait_for_end(cluster, name)
     return (_stamp_of(cluster, name) - called) / _NS_PER_MS
 

@@ -30,13 +30,13 @@ def makespan(cluster: LocalCluster, specs: Sequence[ProcessSpec]) -> float:
     before = cluster.client.list().last_sequence
     started = time.time()
     cluster.client.submit(specs)
-    _wait_for_all(cluster, specs)
+    wait_for_all(cluster, specs)
     events = cluster.client.list(events=True, after=before, newest=10_000).events
     last = max(event.wall_time for event in events if event.kind == "finished")
     return last - started
 
 
-def _wait_for_all(
+def wait_for_all(
     cluster: LocalCluster, specs: Sequence[ProcessSpec], timeout: float = 120.0
 ) -> None:
     """Poll one process after the other, last first: listing all would distort the measurement."""

@@ -18,7 +18,6 @@ from __future__ import annotations
 import argparse
 import http.client
 import os
-import shutil
 import signal
 import statistics
 import subprocess
@@ -31,8 +30,9 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import psutil
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 
+from benchmarks.browser import browser
 from benchmarks.machine import parser, print_report, say
 from benchmarks.scale import Crowd
 from benchmarks.slave_cost import pss_mib
@@ -110,20 +110,6 @@ def stream_ms(cluster: LocalCluster, stream: http.client.HTTPResponse) -> float:
         took.append(1e3 * (time.monotonic() - begun))
         cluster.client.set_host_state(host, "uncordon")
     return statistics.median(took)
-
-
-@contextmanager
-def browser() -> Iterator[Browser]:
-    """Yield Chromium; its sandbox needs a user that is not root."""
-    path = shutil.which("chromium") or shutil.which("chromium-browser")
-    if path is None:
-        raise RosrmError("this machine has no Chromium: apt-get install chromium")
-    with sync_playwright() as driver:
-        chromium = driver.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        try:
-            yield chromium
-        finally:
-            chromium.close()
 
 
 def paint_ms(page: Page, url: str) -> float:

@@ -6,14 +6,13 @@ The pictures are docs/pictures/page-*.png. Needs Chromium.
 from __future__ import annotations
 
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from playwright.sync_api import sync_playwright
+from benchmarks.browser import CHROMIUM, MISSING, browser
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
@@ -40,11 +39,8 @@ class Picture(NamedTuple):
 
 def main() -> int:
     """Run a demo and take all pictures; return the exit status."""
-    chromium = shutil.which("chromium") or shutil.which("chromium-browser")
-    if chromium is None:
-        print(
-            "screenshots: this machine has no Chromium: apt-get install chromium", file=sys.stderr
-        )
+    if CHROMIUM is None:
+        print(f"screenshots: {MISSING}", file=sys.stderr)
         return 2
     OUT.parent.mkdir(exist_ok=True)
     demo = subprocess.Popen(
@@ -54,14 +50,11 @@ def main() -> int:
     try:
         url = wait_for(demo, ADDRESS)[1]
         wait_for(demo, BUSY)
-        with sync_playwright() as driver:
-            # Its sandbox needs a user that is not root.
-            browser = driver.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        with browser() as chromium:
             for one in PICTURES_OF_A_FULL_QUEUE:
-                take(browser, url, one)
+                take(chromium, url, one)
             wait_for(demo, MOVED)
-            take(browser, url, TIMELINE)
-            browser.close()
+            take(chromium, url, TIMELINE)
     finally:
         demo.terminate()
         demo.communicate()
@@ -77,10 +70,10 @@ def wait_for(demo: subprocess.Popen[str], what: re.Pattern[str]) -> re.Match[str
     raise RuntimeError(f"the demo ended with exit code {demo.wait()} before {what.pattern!r}")
 
 
-def take(browser: Any, url: str, picture: Picture) -> None:
+def take(chromium: Any, url: str, picture: Picture) -> None:
     """Open the page, prepare it, and write a picture."""
     size = {"width": picture.width, "height": picture.height}
-    context = browser.new_context(viewport=size, color_scheme=picture.scheme)
+    context = chromium.new_context(viewport=size, color_scheme=picture.scheme)
     context.set_default_timeout(PATIENCE)
     page = context.new_page()
     page.goto(url)

@@ -24,12 +24,13 @@ from tests.criu_kit import criu, theatre  # noqa: F401 - fixtures of several lay
 HERE = Path(__file__).parent
 
 #: Tests that take much memory and CPU, in groups: each runs on one worker, so that no more than two
-#: labs and one browser run at once. The benchmarks measure, on labs that each take a minute.
+#: labs run at once. The benchmarks measure, on labs that each take a minute. All files with the
+#: fixture of a browser are another such group.
 GROUPS = {
     "labs": ("tests/integration/lab/",),
     "benchmarks": ("tests/integration/test_chaos.py", "tests/integration/test_paper.py"),
-    "browser": ("tests/ros/test_web_page.py", "tests/ros/test_web_tree_page.py"),
 }
+BROWSER = "chromium"
 
 #: Tests of a ROS graph that together take as long as a slow one.
 SLOW = 6
@@ -107,13 +108,17 @@ def unit_of_work(nodeid: str) -> str:
         if nodeid.startswith(places):
             return name
     file = nodeid.partition("::")[0]
-    return file if shares_fixtures(file) else nodeid
+    source = source_of(file)
+    if f"({BROWSER}" in source:
+        return BROWSER
+    # The tests of a file share what a fixture starts, such as a cluster.
+    return file if 'scope="module"' in source else nodeid
 
 
 @functools.cache
-def shares_fixtures(file: str) -> bool:
-    """Return True if the tests of a file share what a fixture starts, such as a cluster."""
-    return 'scope="module"' in (HERE.parent / file).read_text(encoding="utf-8")
+def source_of(file: str) -> str:
+    """Return the source of a file with tests."""
+    return (HERE.parent / file).read_text(encoding="utf-8")
 
 
 @pytest.hookimpl(optionalhook=True)

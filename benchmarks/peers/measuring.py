@@ -10,8 +10,9 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -36,19 +37,28 @@ class Executor(Protocol):
 
 #: Makes an executor, of this many calls at the same time.
 Opening = Callable[[int], AbstractContextManager[Executor]]
+#: Name of a measurement to a function of the number of processes.
+Measurements = Mapping[str, Callable[[int], Any]]
 
 
-def main(opening: Opening) -> None:
+def of_executor(opening: Opening) -> Measurements:
+    """Return the measurements of what runs functions."""
+
+    def run(name: str, count: int) -> Any:
+        with opening(count if name == "holders" else SLOTS) as executor:
+            executor.results(executor.start(work.succeed, [None] * _WARM_UP))
+            return _OF_EXECUTOR[name](executor, count)
+
+    return {name: partial(run, name) for name in _OF_EXECUTOR}
+
+
+def main(measurements: Measurements) -> None:
     """Carry out the measurement that the arguments name, and print its result."""
     parser = argparse.ArgumentParser()
-    parser.add_argument("measurement", choices=sorted(MEASUREMENTS))
+    parser.add_argument("measurement", choices=sorted(measurements))
     parser.add_argument("--count", type=int, required=True)
     options = parser.parse_args()
-    at_once = options.count if options.measurement == "holders" else SLOTS
-    with opening(at_once) as executor:
-        executor.results(executor.start(work.succeed, [None] * _WARM_UP))
-        result = MEASUREMENTS[options.measurement](executor, options.count)
-    print(json.dumps(result), flush=True)
+    print(json.dumps(measurements[options.measurement](options.count)), flush=True)
 
 
 def stamps(executor: Executor, count: int) -> list[float]:
@@ -90,6 +100,6 @@ def holders(executor: Executor, count: int) -> float:
         return (newest - began) / 1e9
 
 
-MEASUREMENTS: dict[str, Callable[[Executor, int], Any]] = {
+_OF_EXECUTOR: dict[str, Callable[[Executor, int], Any]] = {
     "stamps": stamps, "jobs": jobs, "sleeps": sleeps, "holders": holders,
 }  # fmt: skip

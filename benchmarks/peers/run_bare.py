@@ -30,4 +30,4 @@ def opened(at_once: int) -> Iterator[Loop]:
 
 
 if __name__ == "__main__":
-    measuring.main(opened)
+    measuring.main(measuring.of_executor(opened))

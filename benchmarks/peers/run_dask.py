@@ -38,4 +38,4 @@ def opened(at_once: int) -> Iterator[Tasks]:
 
 
 if __name__ == "__main__":
-    measuring.main(opened)
+    measuring.main(measuring.of_executor(opened))

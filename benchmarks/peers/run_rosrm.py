@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import tempfile
-import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks import latency, throughput
 from benchmarks.hosts import three_hosts
-from benchmarks.peers import work
+from benchmarks.peers import measuring, work
 from benchmarks.stopping import own_keys
 from rosrm.model.values import Kind, ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
 
 _WARM_UP = 20
-_LONGEST_S = 300.0
 
 
 def stamps(count: int) -> list[float]:
@@ -46,40 +43,32 @@ def holders(count: int) -> float:
     """Return the seconds until processes of 40 MB, submitted at once, have filled their memory."""
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-peers-") as folder,
-        LocalCluster(Path(folder) / "cluster", hosts=three_hosts()) as cluster,
+        LocalCluster(Path(folder), hosts=three_hosts()) as cluster,
     ):
-        files = [Path(folder) / str(number) for number in range(count)]
-        end = Path(folder) / "end"
-        specs = [
-            _job(f"holder{number}", *work.holder(40, str(one), str(end)))
-            for number, one in enumerate(files)
-        ]
-        began = time.time_ns()
-        cluster.client.submit(specs)
-        newest = work.wait_for_files(files, _LONGEST_S)
-        end.touch()
-        return (newest - began) / 1e9
+        return measuring.holders(Holders(cluster), count)
+
+
+class Holders:
+    """Executor of `work.hold` alone: a job for each process."""
+
+    def __init__(self, cluster: LocalCluster) -> None:
+        self._cluster = cluster
+
+    def start(self, function: Callable[[Any], Any], items: Sequence[Any]) -> Sequence[ProcessSpec]:
+        assert function is work.hold
+        specs = [_job(f"holder{number}", *work.holder(*item)) for number, item in enumerate(items)]
+        self._cluster.client.submit(specs)
+        return specs
+
+    def results(self, handle: Sequence[ProcessSpec]) -> list[Any]:
+        throughput.wait_for_all(self._cluster, handle)
+        return []
 
 
 def _job(name: str, *command: str) -> ProcessSpec:
     return ProcessSpec(name, command=command, kind=Kind.JOB)
 
 
-_MEASUREMENTS: dict[str, Any] = {
-    "stamps": stamps, "jobs": jobs, "sleeps": sleeps, "holders": holders,
-}  # fmt: skip
-
-
-def main() -> None:
-    """Carry out the measurement that the arguments name, and print its result."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("measurement", choices=sorted(_MEASUREMENTS))
-    parser.add_argument("--count", type=int, required=True)
-    options = parser.parse_args()
-    with own_keys():
-        result = _MEASUREMENTS[options.measurement](options.count)
-    print(json.dumps(result), flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    with own_keys():
+        measuring.main({"stamps": stamps, "jobs": jobs, "sleeps": sleeps, "holders": holders})

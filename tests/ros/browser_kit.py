@@ -1,13 +1,10 @@
-"""A real browser for tests of the page: Chromium of the system, driven by Playwright."""
+"""Tabs and rows of the page in a real browser, which the fixture `chromium` starts."""
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
-
-import pytest
 
 from tests.waiting import PATIENCE
 
@@ -15,25 +12,6 @@ from tests.waiting import PATIENCE
 BROWSER_PATIENCE = 3 * PATIENCE
 #: Link of `tab` over a bad mobile network: milliseconds of delay, bytes per second.
 SLOW_LINK = {"latency": 400, "downloadThroughput": 250_000, "uploadThroughput": 60_000}
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-
-
-@contextmanager
-def browser() -> Iterator[Any]:
-    """Yield a browser; skip the tests where there is none."""
-    if CHROMIUM is None:
-        pytest.skip("this machine has no Chromium: apt-get install chromium")
-    from playwright.sync_api import sync_playwright
-
-    with sync_playwright() as driver:
-        # Its sandbox needs a user that is not root.
-        one = driver.chromium.launch(
-            executable_path=CHROMIUM, args=["--no-sandbox"], timeout=BROWSER_PATIENCE * 1000
-        )
-        try:
-            yield one
-        finally:
-            one.close()
 
 
 @contextmanager
@@ -55,7 +33,7 @@ def tab(
     try:
         page.goto(url)
         yield page
-    except Exception:
+    except Exception:  # of any test: it is raised again, after what explains it
         print(f"the page shows:\n{page.locator('body').inner_text()}\nits errors: {errors}")
         raise
     else:

@@ -6,10 +6,12 @@ from contextlib import closing
 
 import pytest
 
+from benchmarks.browser import CHROMIUM, MISSING, browser
 from rosrm.node import Node
 from rosrm.testing.loopback import enter_private_network
 from tests.cpp.core_library import VARIABLE
 from tests.cpp.cpp_node import Node as CppNode
+from tests.ros.browser_kit import BROWSER_PATIENCE
 from tests.ros.clusters import STEADY, clusters
 from tests.ros.nodes import KEYS, Counting, Serving, Stage
 from tests.ros.portable_kit import Listener
@@ -33,6 +35,15 @@ def make_shared(tmp_path_factory):
     """Yield a factory of clusters that the tests of a module share."""
     with clusters(lambda: tmp_path_factory.mktemp("c"), liveness=STEADY) as make:
         yield make
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """Yield a browser; skip the tests where there is none."""
+    if CHROMIUM is None:
+        pytest.skip(MISSING)
+    with browser(BROWSER_PATIENCE) as one:
+        yield one
 
 
 @pytest.fixture

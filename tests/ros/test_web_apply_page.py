@@ -9,7 +9,7 @@ from axe_playwright_python.sync_playwright import Axe
 
 from rosrm.config.modes import load_modes
 from rosrm.config.work import load_application
-from tests.ros.browser_kit import browser, open_tab, row, tab
+from tests.ros.browser_kit import open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host
 from tests.ros.web_kit import gateway
 from tests.waiting import wait_until
@@ -41,12 +41,6 @@ def apply(cluster: Cluster, app: str, name: str) -> None:
 @pytest.fixture(scope="module")
 def cluster(make_shared) -> Cluster:
     return make_shared(host("robot-1"), liveness=STEADY)
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with browser() as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

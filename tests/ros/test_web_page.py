@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
-from tests.ros.browser_kit import SLOW_LINK, browser, open_tab, row, tab
+from tests.ros.browser_kit import SLOW_LINK, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
@@ -21,12 +21,6 @@ HTML = "<img src=x onerror=alert(1)>"
 #: Numbered, because the page shows only the last lines.
 BEATS = f'while sleep 1; do echo "{HTML} beat $((n = n + 1))."; done'
 TOKEN = "0123456789abcdef01234567"
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with browser() as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

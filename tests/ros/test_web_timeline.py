@@ -8,7 +8,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 
 from rosrm.model.values import MigrationPolicy
-from tests.ros.browser_kit import browser, tab
+from tests.ros.browser_kit import tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
@@ -20,12 +20,6 @@ MOVES = MigrationPolicy("relaunch")
 HTML = "<img src=x onerror=alert(1)>"
 #: A shape that only arrows have: the line between two lanes.
 ARROW = 'path[stroke-width="1.5"]'
-
-
-@pytest.fixture(scope="module")
-def chromium():
-    with browser() as one:
-        yield one
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rosrm.model.applications import Target
-from tests.ros.browser_kit import browser, open_tab, row, tab
+from tests.ros.browser_kit import open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import gateway
 
@@ -31,9 +31,9 @@ def cluster(make_shared) -> Cluster:
 
 
 @pytest.fixture
-def page(cluster):
+def page(chromium, cluster):
     """Yield the page with the processes."""
-    with browser() as one, gateway(cluster.ros) as web, tab(one, web.url) as page:
+    with gateway(cluster.ros) as web, tab(chromium, web.url) as page:
         open_tab(page, "Processes")
         row(page, "single").wait_for()
         yield page

@@ -155,7 +155,7 @@ def gateway(ros: RosSettings, *words: str, tls: ssl.SSLContext | None = None) ->
     try:
         one.wait_for_address()
         yield one
-    except Exception:
+    except Exception:  # of any test: it is raised again, after what explains it
         print(f"the gateway printed: {one.said}")
         raise
     finally:

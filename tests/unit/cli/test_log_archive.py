@@ -86,8 +86,8 @@ def test_without_a_master_an_application_is_not_called_unknown(rosrm, rig, no_ma
 
 
 def test_a_process_that_master_and_archive_do_not_know_is_refused(rosrm, rig):
-    result = rosrm("logs", "nobody", "--archive", str(rig.directory))
-    assert (result.code, "no such process: 'nobody'" in result.err) == (1, True)
+    result = rosrm("logs", "unknown", "--archive", str(rig.directory))
+    assert (result.code, "no such process: 'unknown'" in result.err) == (1, True)
 
 
 def test_a_directory_that_is_no_archive_is_refused(rosrm, rig, tmp_path):

@@ -40,14 +40,19 @@ def row(sequence: int, process: str) -> EventRow:
     return EventRow(sequence, 1.7e9, float(sequence), "assigned", process, "a", "")
 
 
+async def started() -> tuple[Master, Gateway, Feed]:
+    """Return a master, a gateway that has found it, and the feed of the gateway."""
+    master = Master()
+    gateway = Gateway(lambda _: master)
+    await gateway.watcher.look()
+    return master, gateway, Feed(gateway)
+
+
 def test_the_events_are_read_once_and_then_followed():
     """All browsers share the events; an event that is read twice counts once."""
 
     async def scene() -> None:
-        master = Master()
-        gateway = Gateway(lambda _: master)
-        await gateway.watcher.look()
-        feed = Feed(gateway)
+        master, gateway, feed = await started()
         feed.take([row(2, "early")])
         await asyncio.gather(feed.read(), feed.read())
         assert (placements(feed), feed.newest, master.reads) == (["p"], 2, 1)
@@ -63,10 +68,7 @@ def test_a_burst_that_may_have_a_gap_is_read_again():
     """The watcher leaves out the oldest events of a large burst."""
 
     async def scene() -> None:
-        master = Master()
-        gateway = Gateway(lambda _: master)
-        await gateway.watcher.look()
-        feed = Feed(gateway)
+        master, gateway, feed = await started()
         await feed.read()
         feed.take([row(10 + number, "late") for number in range(MOST_EVENTS)])
         assert placements(feed) == ["p"]
@@ -82,10 +84,7 @@ def test_events_of_a_new_journal_replace_those_of_the_former():
     """Another master has no journal of the former, so its sequences begin again."""
 
     async def scene() -> None:
-        master = Master()
-        gateway = Gateway(lambda _: master)
-        await gateway.watcher.look()
-        feed = Feed(gateway)
+        master, gateway, feed = await started()
         await feed.read()
         master.rows = [row(1, "new")]
         await gateway.watcher.look()
