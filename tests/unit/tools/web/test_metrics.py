@@ -22,6 +22,10 @@ ROOT = Path(__file__).resolve().parents[4]
 RULES = ROOT / "docs/how-to/rosrm.rules.yaml"
 DASHBOARD = ROOT / "docs/how-to/rosrm.grafana.json"
 METRICS = {one.name: one for one in (*table.PRESENT, *table.COUNTED)}
+needs_promtool = pytest.mark.skipif(
+    shutil.which("promtool") is None,
+    reason="no promtool, which Debian's package prometheus has (`.ci/run` installs it as root)",
+)
 #: Ends of the names of the series of a histogram.
 SERIES = re.compile(r"_(bucket|sum|count)$")
 
@@ -217,16 +221,18 @@ def test_alerts_and_panels_use_metrics_and_labels_that_exist(where):
     assert {kind for one in kinds for kind in one.split("|")} <= {one.value for one in EventKind}
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="Debian's package prometheus has it")
+@needs_promtool
 def test_promtool_accepts_the_alert_rules():
     """The checker of Prometheus itself."""
     subprocess.run(["promtool", "check", "rules", RULES], check=True)
 
 
-@pytest.mark.skipif(shutil.which("promtool") is None, reason="Debian's package prometheus has it")
+@needs_promtool
 def test_promtool_accepts_the_metrics():
     """Names, units and types as Prometheus advises."""
-    text = exposition(LISTING, 0.1, counting.EventMetrics())
+    counted = counting.EventMetrics()
+    counted.count([event(EventKind.MIGRATED, strategy="relaunch", seconds=2.0, blackout=0.5)])
+    text = exposition(LISTING, 0.1, counted, LOAD, OWN)
     done = subprocess.run(
         ["promtool", "check", "metrics"], input=text, capture_output=True, check=False
     )
