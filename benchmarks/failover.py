@@ -2,10 +2,12 @@
 
 Four hosts on one machine, in a network of their own. In each round one is switched off: its slave,
 its supervisor and its processes get SIGKILL at one moment, from which all times count. `detect`:
-until the master declares the host lost. `standby`: until an external observer receives an output of
-the standby of a stateful process. `restart`: the same for a process without a standby, which is
-restarted from its snapshot. Then all cores are under full load for minutes (`--minutes`), and the
-hosts that are declared lost are counted; none has failed.
+until the master declares the host lost; `detect_over_lease`: the same less the lease. `standby`:
+until an external observer receives an output of the standby of a stateful process;
+`standby_after_decision`: the same from the master's record of the loss on. `restart`: the same as
+`standby` for a process without a standby, which is restarted from its snapshot. Then all cores are
+under full load for minutes (`--minutes`), and the hosts that are declared lost are counted; none
+has failed.
 
 A cycle publishes its output first, and then its state. `state_lost` counts published states that a
 standby did not have; the goal is 0. `standby_repeated` counts outputs that it published again: one
@@ -36,7 +38,14 @@ from std_msgs.msg import Int64MultiArray
 
 from benchmarks.handoff import Observer, Output
 from benchmarks.handoff_nodes import QOS
-from benchmarks.machine import isolated_transports, parser, print_report, quantiles, say
+from benchmarks.machine import (
+    isolated_transports,
+    milliseconds,
+    parser,
+    print_report,
+    quantiles,
+    say,
+)
 from benchmarks.stopping import run
 from rosrm.config.settings import ClusterConfig, ControlSettings, HostConfig, LivenessSettings
 from rosrm.model.values import (
@@ -134,11 +143,13 @@ class Outcome:
     Attributes:
         detect: until the host was lost.
         standby, restart: until the successor's first output.
+        standby_after_decision: from the loss until the standby's first output.
         standby_continuation, restart_continuation: the cycles from which the successors continued.
     """
 
     detect: list[float] = field(default_factory=list)
     standby: list[float] = field(default_factory=list)
+    standby_after_decision: list[float] = field(default_factory=list)
     restart: list[float] = field(default_factory=list)
     standby_continuation: list[Continuation] = field(default_factory=list)
     restart_continuation: list[Continuation] = field(default_factory=list)
@@ -205,6 +216,7 @@ def _round(cluster: LocalCluster, observer: Witness, name: str, outcome: Outcome
     observer.outputs.clear()
     observer.wait_for(20)
     fault = cluster.switch_off(host)
+    lost_at = _lost_at(cluster, host, last_event)
     for one, row in before.items():
         if row.host != host:
             continue
@@ -213,11 +225,12 @@ def _round(cluster: LocalCluster, observer: Witness, name: str, outcome: Outcome
         seconds = after.received / _NS - fault
         if one == _GUARDED:
             outcome.standby.append(seconds)
+            outcome.standby_after_decision.append(seconds + fault - lost_at)
             outcome.standby_continuation.append(continuation)
         else:
             outcome.restart.append(seconds)
             outcome.restart_continuation.append(continuation)
-    outcome.detect.append(_lost_at(cluster, host, last_event) - fault)
+    outcome.detect.append(lost_at - fault)
     cluster.start_slave(next(one for one in _hosts() if one.host == host))
 
 
@@ -349,6 +362,8 @@ def main() -> int:
             "lease_s": _SHORT[0].lease, "rate_hz": chosen.rate,
             **quantiles("detect", outcome.detect), **quantiles("standby", outcome.standby),
             **quantiles("restart", outcome.restart),
+            **milliseconds("detect_over_lease", [one - _SHORT[0].lease for one in outcome.detect]),
+            **milliseconds("standby_after_decision", outcome.standby_after_decision),
             "state_lost": lost,
             "standbys_of_heard_states": sum(
                 one.published >= one.received - 1 for one in outcome.standby_continuation

@@ -98,6 +98,16 @@ def quantiles(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
     }
 
 
+def milliseconds(name: str, seconds: Sequence[float]) -> dict[str, float | None]:
+    """Return median and 99th percentile as `NAME_p50_ms` and `NAME_p99_ms`; None: no values."""
+    return {
+        f"{name}_p{percent}_ms": (
+            round(1e3 * percentile(seconds, percent / 100), 1) if seconds else None
+        )
+        for percent in (50, 99)
+    }
+
+
 def isolated_transports() -> str:
     """Enter a network namespace if permitted; return the DDS transports used."""
     alone = enter_private_network()

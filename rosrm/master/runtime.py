@@ -71,6 +71,8 @@ _log = logging.getLogger("rosrm.master")
 #: Period of the tick in seconds, which checks readings and deadlines. The cost of a tick does not
 #: depend on the number of readings (docs/decisions/0014).
 _TICK: Final = 0.05
+#: Least seconds to the tick at which the lease of a host ends.
+_SOON: Final = 0.005
 #: Seconds for the discovery of another running master.
 _DISCOVERY: Final = 1.0
 #: Thresholds of the garbage collector; with Python's defaults a burst of submissions takes a third
@@ -311,11 +313,16 @@ class MasterRuntime:
                         self._journal.last_sequence,
                     )  # fmt: skip
                 self._take_in(now)
+                next_tick = min(next_tick, now + self._until_loss(now))
                 if self._diagnostics is not None:
                     self._diagnostics.advance(now, self._core_now(now), self._trouble())
                 self._endpoint.load.note_turn(self._now() - now)
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
+
+    def _until_loss(self, now: float) -> float:
+        """Return the seconds until a silent host is lost, for a tick at that moment."""
+        return max(_SOON, self._state.next_loss - self._core_now(now))
 
     def _say_stopped(self) -> None:
         try:

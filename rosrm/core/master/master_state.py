@@ -92,6 +92,7 @@ class MasterState:
             of submission, because a replay must begin them in the same order.
         held_since: time since when placement waits for first requests for work; inf: no wait.
         contact_since: time since when at least one host reports; inf: none does.
+        next_loss: time at which the next host is lost, unless it reports before; inf: none is.
         unowned_instances: name of a removed process to its instances that may still run.
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
@@ -157,7 +158,7 @@ class MasterState:
         self.periodic = Periodic()
         self.next_order = self.next_instance = self.reserved_instances = 1
         self.wall = 0.0
-        self.contact_since = inf
+        self.contact_since = self.next_loss = inf
         self.held_since = inf
         self.journal_gap = JournalGap()
         self.missing_since: dict[int, float] = {}

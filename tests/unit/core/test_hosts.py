@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import inf
 
 import numpy as np
 import pytest
@@ -253,6 +254,21 @@ def test_a_host_whose_key_was_revoked_gets_no_work() -> None:
     assert cluster.restart_slave("a").accepted
     cluster.settle()
     assert cluster.queue() == []
+
+
+def test_the_next_loss_is_the_end_of_the_lease_of_the_most_silent_host() -> None:
+    """The master awaits this moment, so that a loss is noticed when the lease ends."""
+    cluster = Cluster("a", "b", lease=10.0)
+    assert cluster.state.next_loss == inf
+    cluster.wait(1.0)
+    cluster.cut("a", seconds=2.0)
+    ends = float(cluster.state.hosts.last_contact[cluster.state.hosts.by_name["a"].column]) + 10.0
+    assert cluster.state.next_loss == ends < cluster.now + 9.0
+    cluster.now = ends
+    cluster.read(cluster.machines["b"])
+    cluster.tell(happened.TimePassed())
+    assert len(cluster.recorded("host_lost")) == 1
+    assert cluster.state.next_loss == ends + 10.0
 
 
 def test_a_host_with_a_long_period_is_not_silent() -> None:

@@ -45,6 +45,14 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
     assert master._core_now(clock.now) == pytest.approx(100.0 + passed)
 
 
+@pytest.mark.parametrize(("loss", "wait"), [(100.02, 0.02), (99.0, 0.005), (float("inf"), 0.05)])
+def test_the_loop_wakes_at_the_end_of_a_lease(loss, wait) -> None:
+    """A past end, which the core keeps during a stall, occupies no core with ticks."""
+    master = MasterRuntime.__new__(MasterRuntime)
+    master._state, master._behind, master._held = SimpleNamespace(next_loss=loss), 0.0, None
+    assert min(0.05, master._until_loss(100.0)) == pytest.approx(wait)
+
+
 @pytest.mark.parametrize(
     ("uptime", "incarnation", "stops"),
     [

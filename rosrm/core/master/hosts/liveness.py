@@ -42,7 +42,10 @@ def review_liveness(state: MasterState, now: float) -> None:
     # A host that left need not report, unless instances still run there. The lease of an expected
     # host begins at the start of this master.
     left = (condition == HostCondition.LEFT) & (table.processes > 0)
-    past_lease = (up | suspect | left | (condition == HostCondition.EXPECTED)) & gone
+    watched = up | suspect | left | (condition == HostCondition.EXPECTED)
+    past_lease = watched & gone
+    lease_ends = table.last_contact + lease
+    state.next_loss = float(lease_ends.min(initial=inf, where=watched & ~gone))
     for column in np.flatnonzero(up & ~fresh & ~past_lease):
         _suspect(state, table.hosts[column], float(age[column]), now)
     # A master that receives nothing from any host may itself be cut off.
