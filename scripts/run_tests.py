@@ -3,7 +3,8 @@
 The unit tests, which compute, run beside the integration tests, which mostly wait. In the folders
 that run in real time, a failed test is run once more, alone, at the end of its run. If it passes
 then, it is listed as flaky; both outputs are in build/test-results/flaky. More than two flaky tests
-fail. `--lf` runs what failed last, and only the folders that hold it.
+fail. The end of each failure stands before the table, because a CI often keeps only the end of a
+long output. `--lf` runs what failed last, and only the folders that hold it.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import sys
 import time
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -50,6 +52,10 @@ REAL_TIME = ("integration", "ros", "faults")
 SECOND_CHANCES = 10
 #: More flaky tests than this fail a run.
 FLAKY_ALLOWED = 2
+#: Last lines of a failure that are shown again before the table, and the longest of them.
+FAULT_LINES, FAULT_WIDTH = 30, 300
+#: Most failed tests that are shown there; the flaky ones are all shown.
+FAULTS_SHOWN = 10
 
 # Of pytest's exit statuses:
 TESTS_FAILED = 1
@@ -59,15 +65,27 @@ NO_TESTS = 5
 
 @dataclass(frozen=True)
 class Test:
-    """One test of one run of pytest, with its errors and its output."""
+    """One test of one run of pytest.
+
+    Attributes:
+        outcome: "passed", "failed" or "skipped".
+        text: its errors and its output.
+        fault: its errors alone: tracebacks.
+    """
 
     outcome: str
     text: str
+    fault: str
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The result of one run."""
+    """The result of one run.
+
+    Attributes:
+        flaky: names of the tests that failed, and then passed alone.
+        faults: name of each test that failed, the flaky ones too, to its first failure.
+    """
 
     folders: tuple[str, ...]
     status: int
@@ -76,6 +94,7 @@ class Outcome:
     skipped: int = 0
     seconds: float = 0.0
     flaky: tuple[str, ...] = ()
+    faults: Mapping[str, str] = field(default_factory=dict)
 
 
 def main() -> int:
@@ -152,7 +171,7 @@ def run_folders(
     count = Counter(test.outcome for test in tests.values())
     return Outcome(
         folders, status, count["passed"] + len(flaky), len(failures) - len(flaky), count["skipped"],
-        time.monotonic() - began, flaky,
+        time.monotonic() - began, flaky, {one: tests[one].fault for one in failures},
     )  # fmt: skip
 
 
@@ -182,10 +201,11 @@ def run_pytest(
     tests: dict[str, Test] = {}
     for case in cases:
         # A test that fails in its body and in a fixture's clean-up has two entries; count it once.
-        former = tests.get(node_id(case))
+        former = tests.get(node_id(case), Test("", "", ""))
         tests[node_id(case)] = Test(
-            "failed" if former and former.outcome == "failed" else outcome_of(case),
-            (former.text if former else "") + "\n".join(case.itertext()),
+            "failed" if former.outcome == "failed" else outcome_of(case),
+            former.text + "\n".join(case.itertext()),
+            former.fault + fault_of(case),
         )
     return status, tests
 
@@ -207,6 +227,12 @@ def outcome_of(case: ET.Element) -> str:
     return "skipped" if case.find("skipped") is not None else "passed"
 
 
+def fault_of(case: ET.Element) -> str:
+    """Return the tracebacks of a test that failed; "" if it did not."""
+    faults = [*case.findall("failure"), *case.findall("error")]
+    return "".join(f"{one.text or one.get('message', '')}\n" for one in faults)
+
+
 def keep_outputs(name: str, first: Test, second: Test) -> None:
     """Write both outputs of a flaky test, failed and passed, to a file."""
     path = RESULTS / "flaky" / f"{re.sub(r'[^A-Za-z0-9_.-]+', '_', name)}.txt"
@@ -215,7 +241,8 @@ def keep_outputs(name: str, first: Test, second: Test) -> None:
 
 
 def report(outcomes: list[Outcome], seconds: float) -> int:
-    """Print the table, and as the last line the sums; return the exit status."""
+    """Print the failures, the table, and as the last line the sums; return the exit status."""
+    print_faults(outcomes)
     print(f"\n{'':12}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}")
     for o in outcomes:
         name = "+".join(o.folders)
@@ -237,6 +264,16 @@ def report(outcomes: list[Outcome], seconds: float) -> int:
     if bad or too_many:
         return bad[0] if bad else TESTS_FAILED
     return 0 if passed else NO_TESTS
+
+
+def print_faults(outcomes: list[Outcome]) -> None:
+    """Print the end of the first failure of each flaky test, and of some of the other ones."""
+    failed = [(n, o.faults[n]) for o in outcomes for n in o.faults if n not in o.flaky]
+    flaky = [(n, o.faults[n]) for o in outcomes for n in o.flaky]
+    for name, fault in [*failed[:FAULTS_SHOWN], *flaky]:
+        lines = fault.strip().splitlines()[-FAULT_LINES:]
+        print(f"\n--- how {name} failed first: the last lines ---")
+        print("\n".join(line[:FAULT_WIDTH] for line in lines))
 
 
 def count_flaky(flaky: list[str]) -> Counter[str]:

@@ -26,6 +26,8 @@ class TestFlaky:
 """
 FAILS = "def test_fails(): assert 0\n"
 PASSES = "def test_passes(): pass\n"
+#: The first line of the table.
+TABLE = f"{'':12}{'passed':>8}{'failed':>8}{'skipped':>9}{'seconds':>9}"
 
 
 @pytest.fixture
@@ -76,6 +78,41 @@ def test_both_outputs_of_a_flaky_test_are_kept(run_tests, tmp_path):
     assert "I am 0" in failed
     assert "the first time" not in passed
     assert "I am 0" in passed
+
+
+def faults_of(lines: list[str]) -> dict[str, list[str]]:
+    """Return the lines of each failure that stand before the table, by the name of its test."""
+    found: dict[str, list[str]] = {}
+    for line in lines[: lines.index(TABLE) - 1]:
+        if line.startswith("--- how "):
+            found[line.removeprefix("--- how ").partition(" failed first: ")[0]] = []
+        elif found:
+            found[[*found][-1]].append(line)
+    return found
+
+
+def test_the_first_failure_of_a_flaky_test_stands_before_the_table(run_tests):
+    """A CI that keeps only the end of the output shows the cause, without the test's output."""
+    _, lines = run_tests({"ros/test_a.py": FLAKY, "integration/test_b.py": PASSES})
+    faults, test = faults_of(lines), "tests/ros/test_a.py::TestFlaky::test_now_and_then"
+    assert [*faults] == [f"{test}[a b]", f"{test}[c[d]]"]
+    for fault in faults.values():
+        assert "E           Failed: the first time" in fault
+        assert not any("I am" in line for line in fault if "print" not in line)
+
+
+def test_only_the_last_lines_of_a_failure_stand_before_the_table(run_tests):
+    """A failure with a long output leaves room for the others."""
+    long = f"def test_fails(): assert 0, '\\n'.join(f'line {{n}} {'x' * 1000}' for n in range(99))"
+    (fault,) = faults_of(run_tests({"unit/test_a.py": long})[1]).values()
+    assert len(fault) == 30
+    assert max(map(len, fault)) == 300
+    assert "line 98" in "".join(fault)
+
+
+def test_of_many_failures_some_stand_before_the_table(run_tests):
+    _, lines = run_tests({"unit/test_a.py": failures(11)})
+    assert len(faults_of(lines)) == 10
 
 
 def test_flaky_tests_are_counted_by_name_over_the_runs(run_tests, tmp_path):
