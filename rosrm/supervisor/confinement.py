@@ -83,6 +83,7 @@ class Confinement:
                 here; all are as before.
         """
         given = limits.given_limits
+        self.groups.add(key, limits)
         lacking = self.groups.lacking(key, limits)
         lacking.update((name, why) for name, why in self.missing.items() if name in given)
         if limits.required and lacking:

@@ -4,6 +4,9 @@ The path of a group follows from the instance, so the next supervisor finds it a
 enters its group by inheritance: in version 1 the supervisor itself is in the group while it spawns
 (moving a process that runs would take 10 ms, because the kernel then waits for an RCU grace
 period); in version 2 the kernel starts the process in it (`spawn_into.py`).
+
+In version 1 a group of the controller cpu alone is made only for a limit of CPU time. To enter one
+takes ten times as long as any other, because the scheduler queues the supervisor again.
 """
 
 from __future__ import annotations
@@ -22,8 +25,8 @@ from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
 from rosrm.wording import size
 
-#: Most walks over a group of version 1 whose processes are killed, because they may fork.
-_KILLS: Final = 20
+#: Most walks over the processes of a group of version 1, which may fork.
+_WALKS: Final = 20
 #: Seconds between two attempts to remove a group that the kernel still counts as used.
 _REMOVE_AGAIN: Final = 0.2
 #: Links of a folder without folders in it.
@@ -81,7 +84,7 @@ class InstanceGroups:
         faults: dict[str, str] = {}
         made = []
         for tree in self.trees:
-            if realtime and tree.version == 1 and "cpu" in tree.controllers:
+            if not self._needs(tree, limits, realtime=realtime):
                 continue
             path = _path(tree, key)
             self._emptied.pop(path, None)  # otherwise the new run would be killed
@@ -99,6 +102,27 @@ class InstanceGroups:
         self._unset[key] = {name.removeprefix("limits."): 0.0 for name in faults}
         self._kills_before[key] = self._kills(key)
         return faults
+
+    def _needs(self, tree: Tree, limits: LimitRule, *, realtime: bool) -> bool:
+        """Return True if an instance needs a group in a tree; the first one has its members."""
+        if tree.version != 1 or "cpu" not in tree.controllers:
+            return True
+        only_limits = tree.controllers == ("cpu",) and tree != self.trees[0]
+        return not realtime and bool(limits.cpu or not only_limits)
+
+    def add(self, key: Key, limits: LimitRule) -> None:
+        """Make the groups that a running instance lacks for new limits; move its processes there.
+
+        A limit without its group is in `lacking`.
+        """
+        made = self._made.get(key, ())
+        for tree in self.trees:
+            needs = self._needs(tree, limits, realtime=bool(limits.policy))
+            if made and tree not in made and needs:
+                with contextlib.suppress(OSError):
+                    _make(_path(tree, key), tree)
+                    _move_all(_path(made[0], key), _path(tree, key))
+                    self._made[key] = (*self._made[key], tree)
 
     def lacking(self, key: Key, limits: LimitRule) -> dict[str, str]:
         """Return the limits for which an instance has no group, with the reasons."""
@@ -249,7 +273,7 @@ def kill(path: str) -> None:
     try:
         cgroups.write(os.path.join(path, "cgroup.kill"), "1")
     except OSError:  # version 1, or a kernel before 5.14
-        for _ in range(_KILLS):
+        for _ in range(_WALKS):
             left = pids(path)
             for pid in left:
                 with contextlib.suppress(OSError):
@@ -352,6 +376,21 @@ def _make(path: str, tree: Tree) -> None:
             os.mkdir(path)
 
         make_repeatedly(make_both)
+
+
+def _move_all(source: str, target: str) -> None:
+    """Move the processes of a group of version 1 to another hierarchy, with those that they fork.
+
+    Raises:
+        OSError: a process cannot be moved.
+    """
+    for _ in range(_WALKS):
+        left = set(pids(source)).difference(pids(target))
+        for pid in left:
+            with contextlib.suppress(ProcessLookupError):  # it has ended
+                cgroups.write(os.path.join(target, "cgroup.procs"), str(pid))
+        if not left:
+            return
 
 
 def _enter(path: str) -> None:

@@ -101,11 +101,15 @@ def test_a_process_beyond_its_cpu_limit_waits(host, client) -> None:
 
 
 def read(client: SupervisorClient, name: str) -> tuple[str, str]:
-    """Return the limits of memory and CPU time that the kernel has of an instance."""
+    """Return the limits of memory and CPU time that the kernel has of an instance.
+
+    An instance without a group of the controller cpu is not limited.
+    """
     memory, cpu = (group_of(client, name, controller) for controller in ("memory", "cpu"))
     for files in ("memory.limit_in_bytes", "cpu.cfs_quota_us"), ("memory.max", "cpu.max"):
         if (memory / files[0]).exists():
-            return (memory / files[0]).read_text().strip(), (cpu / files[1]).read_text().strip()
+            of_cpu = (cpu / files[1]).read_text().strip() if cpu.is_dir() else "-1"
+            return (memory / files[0]).read_text().strip(), of_cpu
     raise AssertionError(f"{memory} has no limit")
 
 
@@ -122,6 +126,7 @@ def test_limits_change_while_a_process_runs(host, client) -> None:
     ):  # fmt: skip
         assert host.amend(client, "calm", ONE_RESTART, limits) == ""
         seen.append(read(client, "calm"))
+        assert pid in pids(str(group_of(client, "calm", "cpu")))
         client = host.replace_supervisor(client)
         (status,) = (one for one in client.instances if one.pid == pid)
         given = {"limits.memory": limits.memory, "limits.cpu": limits.cpu}
