@@ -24,11 +24,13 @@ from tests.criu_kit import criu, theatre  # noqa: F401 - fixtures of several lay
 HERE = Path(__file__).parent
 
 #: Tests that take much memory and CPU, in groups: each runs on one worker, so that no more than two
-#: labs run at once. The benchmarks measure, on labs that each take a minute. All files with the
-#: fixture of a browser are another such group.
+#: labs run at once. The benchmarks measure, on labs that each take a minute. The tests of
+#: controllers switch them for the group above all tests. All files with the fixture of a browser
+#: are another such group.
 GROUPS = {
     "labs": ("tests/integration/lab/",),
     "benchmarks": ("tests/integration/test_chaos.py", "tests/integration/test_paper.py"),
+    "controllers": ("tests/integration/supervisor/test_cgroup_v2.py",),
 }
 BROWSER = "chromium"
 
