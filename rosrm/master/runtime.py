@@ -400,6 +400,7 @@ class MasterRuntime:
             self._behind += blocked
 
     def _carry_out(self, commands: Sequence[Command], now: float) -> None:
+        self._endpoint.links.decided_at = time.time_ns()
         try:
             stored = self._write(commands)
         except JournalBlocked as fault:

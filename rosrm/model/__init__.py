@@ -6,6 +6,7 @@ modes.py                modes: sets of applications of which one is in force
 notices.py              notices of events and alerts, as event sinks get them
 artifacts.py            files and directories that processes get on their hosts
 placeholders.py         placeholders in the texts of a process, which its host replaces
+start_trace.py          trace of one start in the environment of its process, traced_values.py
 parameters.py           ROS parameters from several sources, by patterns of nodes
 devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit

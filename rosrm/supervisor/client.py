@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.errors import SupervisorError
+from rosrm.model.start_trace import stamped_in
 from rosrm.model.values import InstanceId, InstanceStatus
 from rosrm.supervisor import json_lines, messages, paths
 from rosrm.supervisor.client_values import (
@@ -202,10 +203,11 @@ class SupervisorClient:
 
     def _launch(self, order: LaunchOrder) -> messages.Launch:
         base = self._base or {}
+        environment = stamped_in(order.environment, launch_sent=time.time_ns())
         changes: dict[str, str | None] = {
-            name: value for name, value in order.environment.items() if base.get(name) != value
+            name: value for name, value in environment.items() if base.get(name) != value
         }
-        changes.update((name, None) for name in base if name not in order.environment)
+        changes.update((name, None) for name in base if name not in environment)
         return messages.Launch(
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,

@@ -16,6 +16,7 @@ from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
 from rosrm.core.supervisor.rules import Key
+from rosrm.model.start_trace import LINE
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import log_index, own_log, paths
 from rosrm.supervisor.log_index import Mark
@@ -199,6 +200,12 @@ class _Log:
             self._has_index = True
         except OSError as error:
             own_log.write(f"the time index of {self.path} was not written: {error}")
+
+
+def note_trace(log: int, stamps: str) -> None:
+    """Write the trace of a start into the log of its process."""
+    with contextlib.suppress(OSError):  # the disk is full
+        os.write(log, os.fsencode(f"{LINE}{stamps}\n"))
 
 
 class LogFolder:

@@ -22,11 +22,13 @@ from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import AdoptionRule, Key
+from rosrm.model import start_trace
 from rosrm.runtime.oom_score import score_of_children
 from rosrm.supervisor import (
     adoption,
     descriptors,
     lease_file,
+    logs,
     messages,
     own_log,
     paths,
@@ -253,7 +255,7 @@ class Server:
             raise spawn.SpawnError(message, transient=True) from None
         try:
             directory = launch.directory or paths.work_directory(self._state)
-            environment = self._environment(launch)
+            environment = start_trace.stamped_in(self._environment(launch), recorded=time.time_ns())
 
             def start(group: int, scheduler: spawn.Scheduler | None) -> int:
                 return spawn.spawn(
@@ -262,7 +264,11 @@ class Server:
                 )  # fmt: skip
 
             with score_of_children(), descriptors.limited(self._files):
-                return self._confinement.start(key, launch.limits, start)
+                confined = self._confinement.start(key, launch.limits, start)
+            if start_trace.VARIABLE in environment and not self._core.instances[key].started:
+                traced = start_trace.stamped_in(environment, spawned=time.time_ns())
+                logs.note_trace(log, traced[start_trace.VARIABLE])
+            return confined
         finally:
             os.close(log)
 
@@ -418,6 +424,9 @@ class Server:
     def _start(self, launch: messages.Launch) -> None:
         if launch.environment not in self._environments:
             raise ProtocolError(f"unknown environment {launch.environment!r}")
+        received = start_trace.stamped_in(launch.changes, supervisor_received=time.time_ns())
+        if received is not launch.changes:
+            launch = launch._replace(changes=received)
         if launch.instance not in self._core.instances:
             self._launches[launch.instance] = launch
             self._record.launch(launch)

@@ -19,6 +19,7 @@ from rosrm.model.applications import Target
 from rosrm.model.codec import to_plain
 from rosrm.model.requester import Requester
 from rosrm.model.rows import Listing
+from rosrm.model.traced_values import stamped_spec
 from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names
 from rosrm.ros.control import (
@@ -189,7 +190,9 @@ class MasterServices:
         return response
 
     def _submitted(self, request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
+        received = time.time_ns()
         specs = self._specs(request.processes)
+        specs = tuple(stamped_spec(spec, master_received=received) for spec in specs)
         return happened.SubmissionReceived(token, specs, _requester(peer))
 
     def _applied(self, request: srv.Apply.Request, token: int, peer: Peer) -> happened.Event:

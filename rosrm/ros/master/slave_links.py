@@ -19,6 +19,7 @@ from rosrm.errors import Refused
 from rosrm.keys.security import Authority, Peer
 from rosrm.model.links import LinkPeer
 from rosrm.model.orders import MeasureLinks, Order, StartInstance, seconds_of
+from rosrm.model.traced_values import stamped_assignment
 from rosrm.model.values import Assignment, HostDescription
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlClient, accepted, version_refusal
@@ -103,6 +104,9 @@ class HostLinks:
         sender: of the orders, for messages.
         order_timeout: seconds beyond an order's own time for its answer.
         handle: receives the events.
+
+    Attributes:
+        decided_at: unix time of the newest decision, ns, for the traces of starts.
     """
 
     def __init__(
@@ -121,6 +125,7 @@ class HostLinks:
         self._waiting: set[int] = set()
         self._with_work: set[int] = set()
         self.reading_stats = ReadingStats()
+        self.decided_at = 0
 
     # --- registered slaves ---------------------------------------------------------------
 
@@ -245,7 +250,10 @@ class HostLinks:
 
     def assign(self, command: Assign) -> None:
         """Keep an assignment for the answer to the host's request."""
-        self._links[command.host_id].outbox.append(command.assignment)
+        assignment = stamped_assignment(
+            command.assignment, decided=self.decided_at, journalled=time.time_ns()
+        )
+        self._links[command.host_id].outbox.append(assignment)
         self._with_work.add(command.host_id)
 
     def open_poll(
@@ -271,9 +279,12 @@ class HostLinks:
                     answer=accepted(epoch=self._epoch),
                     journal=journal,
                     slave_beat=int(self.reading_stats.beat[link.host_id]),
-                    assignments=[convert.assignment_to_msg(self._keyed(one)) for one in batch],
+                    assignments=[convert.assignment_to_msg(self._as_sent(one)) for one in batch],
                 )
             )
+
+    def _as_sent(self, assignment: Assignment) -> Assignment:
+        return stamped_assignment(self._keyed(assignment), assignment_sent=time.time_ns())
 
     def withdraw(self, command: Withdraw, now: float) -> None:
         """Remove an assignment that was not yet fetched, or order its end."""

@@ -21,6 +21,7 @@ from rosrm.errors import Refused
 from rosrm.extensions.plugin_calls import Plugin
 from rosrm.keys.security import Member
 from rosrm.model.devices import Device
+from rosrm.model.traced_values import stamped_assignment
 from rosrm.model.values import HostDescription, InstanceStatus, SnapshotReport
 from rosrm.ros import convert, names, qos
 from rosrm.ros.bounds import MOST_LETTERS
@@ -397,6 +398,7 @@ class SlaveEndpoint:
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
         if response is None:
             return  # the request was renewed, and the former one was lost
+        received = time.time_ns()
         self._poll_at, self._poll_again = 0.0, _POLL_AGAIN
         answer = response.answer
         if not answer.accepted:
@@ -406,7 +408,10 @@ class SlaveEndpoint:
             return
         self._seen.note(Watermark(response.journal, self._incarnation, self.cluster))
         try:
-            work = tuple(convert.assignment_from_msg(one) for one in response.assignments)
+            work = tuple(
+                stamped_assignment(convert.assignment_from_msg(one), slave_received=received)
+                for one in response.assignments
+            )
         except Refused as refusal:
             _log.info("an invalid assignment was refused: %s", refusal)
             return

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.artifacts.cache import set_directory
+from rosrm.model import start_trace
 from rosrm.model.arrays import INDEX_VARIABLE
 from rosrm.model.artifacts import ARTIFACTS_VARIABLE
 from rosrm.model.devices import DEVICE_VARIABLE, Device, device_environment, device_values
@@ -32,7 +33,7 @@ _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
     "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY,
     INDEX_VARIABLE,
-    ARTIFACTS_VARIABLE,
+    ARTIFACTS_VARIABLE, start_trace.VARIABLE,
 )  # fmt: skip
 
 
