@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from rosrm.model.values import InstanceId
 from rosrm.supervisor.instance_groups import group_name, pids
@@ -16,39 +17,60 @@ Trees = Iterable[tuple[int, str, tuple[str, ...]]]
 _USED: Final = {1: ("total_rss", "total_shmem"), 2: ("anon", "shmem")}
 
 
+class _Files(NamedTuple):
+    """Control files of a group.
+
+    Attributes:
+        group: first directory of the group; "": there is none.
+        memory, cpu: file of the usage, "" for none, and version of its tree.
+    """
+
+    group: str
+    memory: tuple[str, int]
+    cpu: tuple[str, int]
+
+
 class InstanceGroup:
     """The control group of one instance, below one directory for each tree.
+
+    The directories are looked up when the group is first read, because most instances of a busy
+    host end before that.
 
     Args:
         trees: of the supervisor; those without a group of the instance are left out.
     """
 
     def __init__(self, trees: Trees, instance: InstanceId) -> None:
-        name = group_name((instance.process, instance.number))
-        self._memory, self._cpu, self._procs = ("", 0), ("", 0), ""
-        for version, top, controllers in trees:
-            group = str(Path(top, name))
+        self._trees = trees
+        self._name = group_name((instance.process, instance.number))
+
+    @cached_property
+    def _files(self) -> _Files:
+        first, memory, cpu = "", ("", 0), ("", 0)
+        for version, top, controllers in self._trees:
+            group = str(Path(top, self._name))
             if not Path(group).is_dir():
                 continue
-            self._procs = self._procs or group
+            first = first or group
             if "memory" in controllers:
-                self._memory = (f"{group}/memory.stat", version)
+                memory = (f"{group}/memory.stat", version)
             if version == 2 or "cpuacct" in controllers:
                 file = "cpuacct.usage" if version == 1 else "cpu.stat"
-                self._cpu = (f"{group}/{file}", version)
+                cpu = (f"{group}/{file}", version)
+        return _Files(first, memory, cpu)
 
     @property
     def exists(self) -> bool:
         """Return True if the instance has a group."""
-        return bool(self._procs)
+        return bool(self._files.group)
 
     def pids(self) -> list[int]:
         """Return the pids of all processes of the instance."""
-        return pids(self._procs)
+        return pids(self._files.group)
 
     def cpu_time(self) -> float | None:
         """Return the CPU seconds of all its processes, ended ones included; None: not measured."""
-        path, version = self._cpu
+        path, version = self._files.cpu
         text = _content(path)
         if not text:
             return None
@@ -56,7 +78,7 @@ class InstanceGroup:
 
     def memory(self) -> int | None:
         """Return anonymous and shared memory in bytes; None: not measured."""
-        path, version = self._memory
+        path, version = self._files.memory
         text = _content(path)
         if not text:
             return None

@@ -108,7 +108,7 @@ class SessionTable:
 
     def add(self, leader: int, group: InstanceGroup | None = None) -> None:
         """Add a session that has begun, by the pid of its leader, who counts at once."""
-        if group is not None and group.exists:
+        if group is not None:
             self._groups[leader] = group
         self._members[leader] = (leader,)
         with contextlib.suppress(OSError):  # it has ended
@@ -162,6 +162,7 @@ class SessionTable:
     def _find_members(self) -> None:
         if not self._members:
             return
+        self._groups = {leader: one for leader, one in self._groups.items() if one.exists}
         found: dict[int, list[int]] = {leader: [leader] for leader in self._members}
         for leader, group in self._groups.items():
             found[leader] += [pid for pid in group.pids() if pid != leader]

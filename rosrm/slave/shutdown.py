@@ -159,8 +159,8 @@ class Shutdown:
         return time.monotonic() + max(graces, default=0.0)
 
     def _stops(self) -> list[StopPolicy | None]:
-        live = [held for held in self.state.held.values() if not held.status.state.ended]
-        return [None if held.spec is None else held.spec.stop for held in live]
+        alive = self.state.alive.values()
+        return [None if held.spec is None else held.spec.stop for held in alive]
 
     def _kill_after(self) -> str:
         """Return the end of a sentence with the time until SIGKILL; "": unknown, or it was sent."""

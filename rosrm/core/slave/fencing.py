@@ -31,7 +31,7 @@ def renew_in_time(state: SlaveState, now: float) -> list[Command]:
 
 def renew(state: SlaveState, now: float) -> list[Command]:
     """Send the last contact to the supervisor, if a live instance has a fence."""
-    if not any(held.fenced and not held.status.state.ended for held in state.held.values()):
+    if not any(held.fenced for held in state.alive.values()):
         return []
     state.renewed_at = now
     return [Renew(state.last_contact, now)]

@@ -62,12 +62,12 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
             continue  # the order arrived twice
         status = _refused(state, assignment, event.given_at, now)
         if status is not None:
-            state.held[instance] = HeldInstance(status, ended_at=now)
+            state.hold(instance, HeldInstance(status, ended_at=now))
             _bury(state, instance)
             refusals.append(status)
             continue
         state.waiting[instance] = assignment
-        state.held[instance] = _waiting(assignment)
+        state.hold(instance, _waiting(assignment))
     launches = _start_waiting(state, now)
     held = [state.held[one.instance] for one in event.assignments if one.instance in state.waiting]
     for one in held:
@@ -125,7 +125,7 @@ def _refuse_late(state: SlaveState, now: float) -> _Commands:
     for instance, why in late.items():
         del state.waiting[instance]
         status = InstanceStatus(instance, InstanceState.FENCED, message=why)
-        state.held[instance] = HeldInstance(status, ended_at=now)
+        state.hold(instance, HeldInstance(status, ended_at=now))
         _bury(state, instance)
     return [commands.Report(tuple(state.held[one].status for one in late))] if late else []
 
@@ -144,6 +144,7 @@ def _launch_refused(state: SlaveState, event: events.LaunchRefused, now: float) 
         return []
     held.status = InstanceStatus(event.instance, InstanceState.REFUSED, message=event.reason)
     held.ready_by, held.ended_at = None, now
+    state.hold(event.instance, held)
     _bury(state, event.instance)
     return [*_start_waiting(state, now), commands.Report((held.status,))]
 
@@ -174,7 +175,7 @@ def _end_ordered(
     status = InstanceStatus(
         instance, InstanceState.REFUSED, message="it was stopped before it was started"
     )
-    state.held[instance] = HeldInstance(status, ended_at=now)
+    state.hold(instance, HeldInstance(status, ended_at=now))
     return [commands.Report((status,))]
 
 
@@ -273,7 +274,7 @@ def _supervisor_replaced(
     for instance, held in list(state.held.items()):
         lost = instance not in known and instance not in state.waiting
         if lost and not held.status.state.ended:
-            del state.held[instance]
+            state.drop(instance)
             _bury(state, instance)
         held.judgement = None  # judge again, because the order to fail the run may be lost
         again += [
@@ -306,7 +307,7 @@ def _follow(
     held = state.held.get(reported.instance)
     if held is None:
         known = memo or Memo()
-        held = state.held[reported.instance] = HeldInstance(
+        held = HeldInstance(
             reported, awaited=known.awaited, watch=known.watch, devices=known.devices,
             artifacts=known.artifacts, lifecycle=known.lifecycle, loads=known.loads,
         )  # fmt: skip
@@ -324,6 +325,7 @@ def _follow(
     else:
         held.ready_by = held.steering = held.loading = None
         held.status = _with_unready(held, reported)
+    state.hold(reported.instance, held)
     if held.status.state.ended:
         held.ended_at = now
         _bury(state, reported.instance)
@@ -463,7 +465,7 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
             forgotten.append(instance)
     if forgotten:
         for instance in forgotten:
-            held = state.held.pop(instance)
+            held = state.drop(instance)
             orders += [commands.Settle(instance, restart) for restart in held.unsettled]
         orders.append(commands.Forget(tuple(forgotten)))
     return orders

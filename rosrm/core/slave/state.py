@@ -148,6 +148,7 @@ class SlaveState:
             unknown.
         renewed_at: time of the last `Renew` to the supervisor.
         held: all instances, including ended ones that may still be reported.
+        alive: those of `held` that have not ended. Many ended ones would slow down each start.
         waiting: assignments that start as soon as the bounds allow, in order.
         tombstones: ended and refused instances, which never start on this host again.
     """
@@ -161,32 +162,43 @@ class SlaveState:
     last_contact: float = 0.0
     renewed_at: float = 0.0
     held: dict[InstanceId, HeldInstance] = field(default_factory=dict)
+    alive: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
+    def hold(self, instance: InstanceId, held: HeldInstance) -> HeldInstance:
+        """Add an instance, or note that its status is another one."""
+        self.held[instance] = held
+        if held.status.state.ended:
+            self.alive.pop(instance, None)
+        else:
+            self.alive[instance] = held
+        return held
+
+    def drop(self, instance: InstanceId) -> HeldInstance:
+        """Forget an instance, and return it."""
+        self.alive.pop(instance, None)
+        return self.held.pop(instance)
+
     def used_artifacts(self) -> list[tuple[Artifact, ...]]:
         """Return the artifacts of each instance that has not ended."""
-        return [
-            held.artifacts
-            for held in self.held.values()
-            if held.artifacts and not held.status.state.ended
-        ]
+        return [held.artifacts for held in self.alive.values() if held.artifacts]
 
     def awaited_in_graph(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances that become ready when their node appears in the ROS graph."""
-        return {instance: held for instance, held in self.held.items() if held.ready_by is not None}
+        return {one: held for one, held in self.alive.items() if held.ready_by is not None}
 
     def nodes(self) -> Mapping[int, str]:
         """Return the number of each ready instance with a node to the node's full name."""
         return {
             instance.number: held.awaited.node_name
-            for instance, held in self.held.items()
+            for instance, held in self.alive.items()
             if held.awaited is not None and held.status.state is InstanceState.READY
         }
 
     def watched(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances with health checks that apply now."""
-        return {one: held for one, held in self.held.items() if held.watched is not None}
+        return {one: held for one, held in self.alive.items() if held.watched is not None}
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
         """Return the status of every instance, including ended ones that may still be reported."""
@@ -217,12 +229,12 @@ class SlaveState:
         """Return the number of instances being started, or running and not ready yet."""
         return sum(
             held.status.state is InstanceState.STARTING or held.becomes_ready
-            for held in self.held.values()
+            for held in self.alive.values()
         )
 
     def live(self) -> int:
         """Return the number of instances that have not ended."""
-        return sum(not held.status.state.ended for held in self.held.values())
+        return len(self.alive)
 
 
 def under_limits(

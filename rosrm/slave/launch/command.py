@@ -60,7 +60,7 @@ def launch_order(
     spec = assignment.spec
     environment = process_environment(assignment, base_environment, where, launchers.variables)
     filled = with_packages(spec, ament_index.search_path(environment, python))
-    if filled != spec:
+    if filled is not spec:
         spec, assignment = filled, replace(assignment, spec=filled)
         environment = process_environment(assignment, base_environment, where, launchers.variables)
     try:

@@ -25,9 +25,13 @@ def filled(assignment: Assignment, values: Mapping[str, str]) -> Assignment:
 
 
 def with_texts(spec: ProcessSpec, change: Callable[[str], str]) -> ProcessSpec:
-    """Return a spec with changed texts in the fields in which placeholders stand."""
-    texts = {name: _changed(getattr(spec, name), change) for name in WITH_PLACEHOLDERS}
-    return replace(spec, **texts)
+    """Return a spec with changed texts in the fields in which placeholders stand.
+
+    The same spec if there is nothing to change, as in most starts.
+    """
+    given = {name: value for name in WITH_PLACEHOLDERS if (value := getattr(spec, name))}
+    texts = {name: _changed(value, change) for name, value in given.items()}
+    return spec if texts == given else replace(spec, **texts)
 
 
 def _changed(value: Any, change: Callable[[str], str]) -> Any:

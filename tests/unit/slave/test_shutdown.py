@@ -49,7 +49,7 @@ class Slave:
     def report(self, name: str, state: InstanceState) -> None:
         instance = InstanceId(name, 1)
         spec = ProcessSpec(name, command=("sleep",), stop=STOP)
-        self.state.held[instance] = HeldInstance(InstanceStatus(instance, state), spec)
+        self.state.hold(instance, HeldInstance(InstanceStatus(instance, state), spec))
 
     def end(self) -> int:
         return self.ending.carry_out("SIGINT")
