@@ -32,6 +32,8 @@ class Clock:
     def monotonic_ns(self) -> int:
         return int(self.now * 1e9)
 
+    time_ns = monotonic_ns
+
 
 class Host:
     """Fake runtime of the slave."""
