@@ -82,7 +82,7 @@ class LogCollector:
         self._logs: dict[tuple[str, str], _Log] = {}
         self._up: frozenset[str] = frozenset()
         self._sequence = 0
-        self._said: dict[str, str] = {}
+        self._said: dict[tuple[str, str], str] = {}
         self._silent: dict[str, float] = {}
 
     def look(self, master: MasterClient) -> None:
@@ -110,7 +110,7 @@ class LogCollector:
                 self._collect(master, host, process)
             except NoMaster as error:
                 self._silent[host] = time.monotonic() + _SILENT
-                self._say(host, str(error))
+                self._say((host, ""), str(error))
                 self._take(self._list(master))  # raises if the master does not answer
             except Refused as refusal:
                 self._settle(host, process, refusal)
@@ -119,7 +119,8 @@ class LogCollector:
                     raise
                 self._settle(host, process, Refused("its name is too long for a file", "invalid"))
             else:
-                self._said.pop(host, None)
+                for at in ((host, ""), (host, process)):
+                    self._said.pop(at, None)
 
     # --- which logs ----------------------------------------------------------------------
 
@@ -149,6 +150,8 @@ class LogCollector:
         self._logs = {
             at: log for at, log in self._logs.items() if at[1] in listed or log.due < _NEVER
         }
+        known = {(row.description.name, "") for row in listing.hosts} | self._logs.keys()
+        self._said = {at: text for at, text in self._said.items() if at in known}
 
     def _note_row(self, row: ProcessRow) -> None:
         if not row.host or not row.number:
@@ -175,11 +178,12 @@ class LogCollector:
         log = self._logs[host, process]
         log.due, log.numbers = _NEVER, ()
         if refusal.code != "unknown":
-            self._say(f"{process} on {host}", f"the log of {process} on {host}: {refusal}")
+            self._say((host, process), f"the log of {process} on {host}: {refusal}")
 
-    def _say(self, about: str, text: str) -> None:
-        if self._said.get(about) != text:
-            self._said[about] = text
+    def _say(self, at: tuple[str, str], text: str) -> None:
+        """Pass on a sentence about a host, or a process on a host, once."""
+        if self._said.get(at) != text:
+            self._said[at] = text
             self._notify(text)
 
     # --- one log -------------------------------------------------------------------------

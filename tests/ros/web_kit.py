@@ -37,7 +37,7 @@ class Answer:
 
 
 class Change(NamedTuple):
-    """A server-sent event; number 0: it has no id."""
+    """A server-sent event with the sequence in its id; 0: it has none."""
 
     kind: str
     number: int
@@ -144,7 +144,11 @@ def _changes(lines: Iterable[bytes]) -> Iterator[Change]:
         if mark:
             fields[name] = value
         elif fields:
-            yield Change(fields["event"], int(fields.get("id", 0)), json.loads(fields["data"]))
+            yield Change(
+                fields["event"],
+                int(fields.get("id", "0").partition("-")[0]),
+                json.loads(fields["data"]),
+            )
             fields = {}
 
 

@@ -118,6 +118,13 @@ TestShipping = Shipping.TestCase
 TestShipping.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
 
 
+def fail_with(error):
+    def fail(*_):
+        raise error
+
+    return fail
+
+
 @pytest.fixture
 def rig(tmp_path, monkeypatch):
     return Rig(tmp_path)
@@ -387,3 +394,13 @@ def test_impossible_times_are_left_out(rig):
     rig.master.read_log = lambda *_: part
     rig.collect()
     assert list(rig_part(rig).marks) == [(7.0, 3, 0), (9.0, 4, 0)]
+
+
+def test_a_sentence_is_forgotten_with_its_process(rig):
+    """Names of jobs never end; a process that returns with the same error is reported again."""
+    rig.alpha.read_log = fail_with(Refused("the disk is damaged", "failed"))
+    for name in ("job-1", "job-2"):
+        rig.master.processes = [process(name, host=HOST)]
+        rig.collect(2)
+    assert [text.split()[3] for text in rig.said] == ["job-1", "job-2"]
+    assert list(rig.collector._said) == [(HOST, "job-2")]

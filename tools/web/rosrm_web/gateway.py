@@ -50,6 +50,7 @@ class Gateway:
         # First, so that no reader of an event gets a listing from before it.
         self.watcher.on_events.append(lambda _: self.forget_listings())
         self.watcher.on_events.append(self.broadcast.send_events)
+        self.watcher.on_new_journal.append(self.broadcast.send_reset)
         self.watcher.on_master.append(lambda master: self.broadcast.send(master_part(master)))
 
     def open_archive(self) -> LogArchive | None:

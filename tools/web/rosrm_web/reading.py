@@ -14,7 +14,7 @@ from rosrm.cli.output import json_forms
 from rosrm.client.logs import LogSelection
 from rosrm.errors import NoMaster
 from rosrm.model.rows import HostRow, PluginRow
-from rosrm.model.values import HostDescription
+from rosrm.model.values import LARGEST_NUMBER, HostDescription
 from rosrm_web.watching import MOST_EVENTS, give_up_early
 
 if TYPE_CHECKING:
@@ -137,7 +137,9 @@ class Reading:
         self,
         process: Annotated[str, _Filter] = "",
         host: Annotated[str, _Filter] = "",
-        after: Annotated[int, Query(ge=0, description="Sequence before the first event.")] = 0,
+        after: Annotated[
+            int, Query(ge=0, le=LARGEST_NUMBER, description="Sequence before the first event.")
+        ] = 0,
         newest: Annotated[int, Query(ge=1, le=MOST_EVENTS, description="Most events.")] = 100,
     ) -> Response:
         """List events, the oldest first."""

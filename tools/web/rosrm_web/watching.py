@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 from rosrm.errors import NoMaster, RosrmError
+from rosrm_web.master_link import Busy
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
@@ -81,14 +82,18 @@ class Watcher:
         """Ask once; raises `RosrmError`."""
         try:
             listing = await self._link.ask(self._list)
+        except Busy:  # nothing was sent, so the state of the master is as before
+            raise
         except RosrmError as error:
             state: State = "lost" if self._after >= 0 else "searching"
             self._set_master(MasterState(state, str(error)))
             raise
         self._set_master(MasterState("up", ""))
         if listing.last_sequence < self._after:
+            self._after = 0  # the next request has the first events of the new journal
             for forget in self.on_new_journal:
                 forget()
+            return
         self._after = listing.last_sequence
         for call in self.on_events if listing.events else ():
             try:

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+import threading
+
+import pytest
 
 from rosrm.model.rows import EventRow, Listing
 from rosrm_web.gateway import Gateway
+from rosrm_web.master_link import MOST_WAITING, Busy
 
 
 class Master:
@@ -47,6 +51,28 @@ def test_a_reader_of_events_that_fails_stops_neither_the_others_nor_the_watcher(
         await asyncio.wait_for(third.wait(), 30.0)
         assert seen[:3] == [1, 2, 3]
         watching.cancel()
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_a_gateway_with_too_many_requests_does_not_count_its_master_as_lost():
+    """The watcher cannot ask then, which says nothing about the master."""
+
+    async def scene() -> None:
+        gateway = Gateway(lambda _: Master())
+        await gateway.watcher.look()
+        free = threading.Event()
+        waiting = [
+            asyncio.create_task(gateway.reading.ask(lambda _: free.wait(30.0)))
+            for _ in range(MOST_WAITING)
+        ]
+        await asyncio.sleep(0)  # each task sends its request
+        with pytest.raises(Busy):
+            await gateway.watcher.look()
+        assert gateway.watcher.master.state == "up"
+        free.set()
+        assert all(await asyncio.gather(*waiting))
         gateway.close()
 
     asyncio.run(scene())
