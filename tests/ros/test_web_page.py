@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
+from rosrm.config.settings import MigrationSettings
+from rosrm.model.values import MigrationPolicy
 from tests.ros.browser_kit import SLOW_LINK, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
@@ -157,8 +161,8 @@ def tokens(tmp_path) -> Path:
     return file
 
 
-@pytest.fixture
-def operated(chromium, cluster, tokens):
+@contextmanager
+def operating(chromium: Any, cluster: Cluster, tokens: Path) -> Iterator[Any]:
     """Yield the page of an operator; without a token there is only the form."""
     with (
         gateway(cluster.ros, "--tokens", str(tokens), "--allow-actions") as web,
@@ -166,7 +170,13 @@ def operated(chromium, cluster, tokens):
     ):
         page.get_by_label("Token").fill(TOKEN)
         page.get_by_role("button", name="Log in").click()
-        row(page, "robot-2").wait_for()
+        row(page, "robot-").wait_for()
+        yield page
+
+
+@pytest.fixture
+def operated(chromium, cluster, tokens):
+    with operating(chromium, cluster, tokens) as page:
         yield page
 
 
@@ -178,6 +188,49 @@ def test_an_operator_acts(operated):
     cordoned.wait_for()
     act(operated, "Uncordon", "robot-2 gets new processes again.")
     cordoned.wait_for(state="detached")
+
+
+def test_a_move_has_a_choice_of_the_hosts_that_fit(operated, cluster):
+    """Any host comes first; the explanation has decided which hosts fit.
+
+    No strategy of this cluster writes images, so there is no button for a checkpoint.
+    """
+    cluster.submit(service("mover", migration=MigrationPolicy("relaunch")))
+    source = cluster.wait("mover", "running").host
+    (other,) = {"robot-1", "robot-2"} - {source}
+    open_tab(operated, "Processes")
+    row(operated, "mover").dblclick()
+    operated.get_by_role("dialog").get_by_role("cell", name="chosen").wait_for()
+    assert operated.get_by_role("button", name="Checkpoint").count() == 0
+    operated.get_by_role("button", name="Move", exact=True).click()
+    question = operated.get_by_role("dialog").filter(has_text="mover moves to another host.")
+    question.get_by_label("To").click()
+    options = operated.get_by_role("option")
+    options.first.wait_for()
+    assert options.all_inner_texts() == ["any host", other]
+    options.last.click()
+    question.get_by_role("button", name="Move", exact=True).click()
+    cluster.wait("mover", "running", host=other)
+    cluster.cancel("mover")
+
+
+def test_a_process_is_checkpointed_and_restored(criu, chromium, make_cluster, tokens):
+    """The dialog has the button of what is possible, and each asks once."""
+    strategies = MigrationSettings(strategies={"criu": {}}, automatic=False)
+    cluster = make_cluster(host("robot-1"), liveness=STEADY, migration=strategies)
+    cluster.submit(service("held", "sleep", "1000"))
+    cluster.wait("held", "running")
+    with operating(chromium, cluster, tokens) as page:
+        open_tab(page, "Processes")
+        row(page, "held").dblclick()
+        act(page, "Checkpoint", "ends until it is restored")
+        cluster.wait("held", "checkpointed")
+        assert page.get_by_role("button", name="Restore").count() == 0
+        page.keyboard.press("Escape")
+        row(page, "held").filter(has_text="checkpointed").dblclick()
+        act(page, "Restore", "continues from its image")
+        cluster.wait("held", "running")
+    cluster.cancel("held")
 
 
 def test_the_page_of_an_operator_who_becomes_a_viewer_is_replaced(operated, tokens):

@@ -10,8 +10,10 @@ from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.assignment.flows import described_flows
 from rosrm.core.master.assignment.neighbours import awaited_neighbour
 from rosrm.core.master.checkpoint import periodic
+from rosrm.core.master.checkpoint.image_requests import why_no_checkpoint, why_no_restore
 from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration.eviction import hosts_to_move_to
 from rosrm.core.master.process_defaults import defaulted_values
 from rosrm.core.master.schedules import why_scheduled
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
@@ -212,6 +214,11 @@ def explanation(state: MasterState, name: str, now: float) -> Mapping[str, Any] 
         **described_flows(state, process),
         "kept": _replicas(state, process, now),
         "checkpoint": periodic.of_process(state, process, now),
+        "possible": {
+            "move": hosts_to_move_to(state, process),
+            "checkpoint": not why_no_checkpoint(state, process),
+            "restore": not why_no_restore(state, process),
+        },
         "history": [
             {"elapsed": now - at, "kind": kind, "message": message}
             for at, kind, message in process.history

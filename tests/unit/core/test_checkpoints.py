@@ -93,6 +93,15 @@ def test_a_restore_starts_from_the_image() -> None:
     assert shelf.images == {instance.number}
 
 
+def test_an_explanation_says_what_can_be_requested() -> None:
+    """A running process can be checkpointed, and only a checkpointed one restored."""
+    shelf, cluster = playing()
+    assert cluster.explain("p")["possible"] == {"move": [], "checkpoint": True, "restore": False}
+    cluster.checkpoint("p")
+    is_checkpointed(shelf)
+    assert cluster.explain("p")["possible"] == {"move": [], "checkpoint": False, "restore": True}
+
+
 def test_a_process_keeps_the_name_of_its_node_through_an_image() -> None:
     """A process that moved by a handoff keeps running under its alias."""
     shelf, cluster = playing()

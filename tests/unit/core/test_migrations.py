@@ -207,7 +207,9 @@ def test_a_move_is_refused_with_its_reason() -> None:
         reply = cluster.migrate(*asked)
         assert not reply.accepted
         assert said in reply.message
+    assert cluster.explain("p")["possible"]["move"] == ["b"]
     cluster.set_host("b", "cordon")
+    assert cluster.explain("p")["possible"]["move"] == []
     assert "p does not fit on b: it is cordoned" in cluster.migrate("p", "b").message
     cluster.set_host("b", "uncordon")
     cluster.migrate("p")

@@ -52,21 +52,28 @@ def begin_checkpoint(
     Returns:
         None; or the reason why the process cannot be checkpointed, and nothing has changed.
     """
-    refusal = _why_no_checkpoint(state, process)
+    refusal = why_no_checkpoint(state, process)
     if refusal:
         return Rejected(refusal)
     owner, name = state.instances[process.owner], _strategy_of(state, process)
-    if not name:
-        return Rejected(_why_no_strategy(state, process))
-    refusal = capabilities.fault(state, name, owner.host, owner.host)
-    if refusal:
-        return Rejected(f"{process.name} cannot be checkpointed: {refusal}")
     node = owner.node_name or process.spec.node
     move = move_of(state, process, owner.id, owner.host, owner.host, node)
     return _begin(state, process, move, name, Aim.CHECKPOINT, now, cause=cause)
 
 
-def _why_no_checkpoint(state: MasterState, process: Process) -> str:
+def why_no_checkpoint(state: MasterState, process: Process) -> str:
+    """Return why a process cannot be checkpointed now; "": its strategy is asked for a plan."""
+    refusal = _why_not_dumped(state, process)
+    if refusal:
+        return refusal
+    owner, name = state.instances[process.owner], _strategy_of(state, process)
+    if not name:
+        return _why_no_strategy(state, process)
+    fault = capabilities.fault(state, name, owner.host, owner.host)
+    return f"{process.name} cannot be checkpointed: {fault}" if fault else ""
+
+
+def _why_not_dumped(state: MasterState, process: Process) -> str:
     if process.name in state.migrations:
         return why_busy(state.migrations[process.name])
     if process.phase is ProcessPhase.CHECKPOINTED:
@@ -118,7 +125,7 @@ def begin_restore(state: MasterState, process: Process, cause: str, now: float) 
         None; or the reason why the process cannot be restored, and nothing has changed.
     """
     image = process.image
-    refusal = _why_no_restore(state, process)
+    refusal = why_no_restore(state, process)
     if refusal or image is None:
         return Rejected(refusal)
     host = state.hosts.by_name[image.host]
@@ -136,7 +143,8 @@ def begin_restore(state: MasterState, process: Process, cause: str, now: float) 
     )
 
 
-def _why_no_restore(state: MasterState, process: Process) -> str:
+def why_no_restore(state: MasterState, process: Process) -> str:
+    """Return why a process cannot be restored, apart from the room that it needs; "": it can."""
     if process.name in state.migrations:
         return why_busy(state.migrations[process.name])
     image = process.image

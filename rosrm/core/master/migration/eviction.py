@@ -235,8 +235,7 @@ def plan_moves(
     source, lacking = state.instances[process.owner].host, dict[str, str]()
     while True:
         rankings = _rankings_to_move(state, moving, headroom, lacking)
-        demands = {name: ranking.demand for name, ranking in rankings.items()}
-        ranking = ranking_of(state, joint_demand(state, demands))
+        ranking = _joint_ranking(state, rankings)
         destination = _destination(state, process, ranking, source, host)
         if isinstance(destination, Rejected):
             return Rejected("; ".join(dict.fromkeys(lacking.values()))) if lacking else destination
@@ -256,6 +255,24 @@ def plan_moves(
         for one, migration in zip(moving, migrations, strict=True)
     ]
     return PlannedMoves(destination, tuple(steps))
+
+
+def hosts_to_move_to(state: MasterState, process: Process) -> list[str]:
+    """Return the hosts to which a process can be moved now, at most 16, the best first.
+
+    A host may still lack an executor of the plan, which only the strategy knows.
+    """
+    moving = [process, *running_with(state, process)]
+    if why_immovable(state, process) or _why_bound(state, moving):
+        return []
+    ranking = _joint_ranking(state, _rankings_to_move(state, moving, 0.0, {}))
+    return [state.hosts.hosts[column].name for column in ranking.in_order()[:_MOST_HOSTS]]
+
+
+def _joint_ranking(state: MasterState, rankings: Mapping[str, Ranking]) -> Ranking:
+    """Return the ranking of hosts that take all of some processes."""
+    demands = {name: ranking.demand for name, ranking in rankings.items()}
+    return ranking_of(state, joint_demand(state, demands))
 
 
 def _why_bound(state: MasterState, moving: Sequence[Process]) -> str:

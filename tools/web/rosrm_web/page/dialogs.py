@@ -15,6 +15,7 @@ from nicegui import background_tasks, ui
 from rosrm.cli.output import explain
 from rosrm.client.logs import LogSelection
 from rosrm.errors import RosrmError
+from rosrm.model.values import EMPTY
 from rosrm.wording import duration, listed, percent
 
 if TYPE_CHECKING:
@@ -38,25 +39,41 @@ class Action:
     Attributes:
         title: text of the button.
         warning: effect of the action, shown for confirmation before it begins.
-        request: to the master, with the name of the process or host; returns its message.
+        request: to the master, with the name of the process or host, and the chosen host ("": any);
+            returns its message.
+        only_if: part of `possible` in an explanation, without which there is no button; "": none.
+        to_host: the user may choose a host for it.
     """
 
     title: str
     warning: str
-    request: Callable[[Client, str], str]
+    request: Callable[[Client, str, str], str]
+    only_if: str = ""
+    to_host: bool = False
 
 
 OF_PROCESS: Final = (
-    Action("Restart", "{name} is stopped and started again.", lambda c, name: c.restart([name])),
-    Action("Move", "{name} moves to another host.", lambda c, name: c.migrate(name)),
-    Action("Cancel", "{name} is stopped for good.", lambda c, name: c.cancel([name])),
-)
+    Action("Restart", "{name} is stopped and started again.", lambda c, name, _: c.restart([name])),
+    Action(
+        "Move", "{name} moves to another host.",
+        lambda c, name, host: c.migrate(name, host or None), to_host=True,
+    ),
+    Action(
+        "Checkpoint", "{name} is written to an image on its host, and ends until it is restored.",
+        lambda c, name, _: c.checkpoint(name), only_if="checkpoint",
+    ),
+    Action(
+        "Restore", "{name} continues from its image, on the host of the image.",
+        lambda c, name, _: c.restore(name), only_if="restore",
+    ),
+    Action("Cancel", "{name} is stopped for good.", lambda c, name, _: c.cancel([name])),
+)  # fmt: skip
 OF_HOST: Final = (
-    Action("Cordon", "{name} gets no new processes.", lambda c, name: c.cordon(name)),
-    Action("Uncordon", "{name} gets new processes again.", lambda c, name: c.uncordon(name)),
+    Action("Cordon", "{name} gets no new processes.", lambda c, name, _: c.cordon(name)),
+    Action("Uncordon", "{name} gets new processes again.", lambda c, name, _: c.uncordon(name)),
     Action(
         "Drain", "{name} gets no new processes, and those that can leave it move away.",
-        lambda c, name: c.drain(name),
+        lambda c, name, _: c.drain(name),
     ),
 )  # fmt: skip
 
@@ -75,27 +92,40 @@ class Dialog:
     ) -> None:
         self._gateway, self._on_action = gateway, on_action
         self.name = ""
+        self._possible: Mapping[str, Any] = EMPTY
+        self._optional: dict[str, ui.button] = {}
         with ui.dialog() as self.dialog:
             self.card = ui.card().classes("w-full max-w-screen-lg")
         self._question = Question()
         with self.card, heading(self.dialog) as self._title:
             for action in actions:
-                ui.button(action.title, color=None, on_click=partial(self._confirm, action)).props(
-                    "outline no-caps"
-                )
+                button = ui.button(
+                    action.title, color=None, on_click=partial(self._confirm, action)
+                ).props("outline no-caps")  # fmt: skip
+                if action.only_if:
+                    self._optional[action.only_if] = button
 
     def open(self, name: str) -> None:
         """Show the process or host of this name."""
         self.name = self._title.text = name
+        self.offer(EMPTY)
         self.dialog.open()
+
+    def offer(self, possible: Mapping[str, Any]) -> None:
+        """Show the buttons of what is possible now, as an explanation has it."""
+        self._possible = possible
+        for name, button in self._optional.items():
+            button.set_visibility(bool(possible.get(name)))
 
     async def _confirm(self, action: Action) -> None:
         name = self.name
-        if not await self._question.ask(action.warning.format(name=name), action.title):
+        hosts = ("", *self._possible.get("move", ())) if action.to_host else ()
+        if not await self._question.ask(action.warning.format(name=name), action.title, hosts):
             return
+        host = self._question.host
         try:
             message = await self._gateway.ask(
-                self._gateway.acting, lambda client: action.request(client, name)
+                self._gateway.acting, lambda client: action.request(client, name, host)
             )
             ui.notify(message)
         except RosrmError as error:
@@ -115,19 +145,28 @@ def heading(dialog: ui.dialog) -> Iterator[ui.label]:
 
 
 class Question:
-    """A dialog that asks the user to confirm an action."""
+    """A dialog that asks the user to confirm an action.
+
+    Attributes:
+        host: the host that the user chose last; "": any.
+    """
 
     def __init__(self) -> None:
         self._dialog = ui.dialog()
+        self.host = ""
 
-    async def ask(self, effect: str, title: str) -> bool:
-        """Return True if the user confirms an action with this effect."""
+    async def ask(self, effect: str, title: str, hosts: Sequence[str] = ()) -> bool:
+        """Return True if the user confirms an action with this effect; offer a choice of hosts."""
         question = self._dialog
         if question.value:
             return False  # a second press, before the browser shows the question
         question.clear()
         with question, ui.card():
             question.props(f"aria-labelledby={ui.label(effect).html_id}")
+            self.host = ""
+            if hosts:
+                names = {host: host or "any host" for host in hosts}
+                ui.select(names, label="To", value="").bind_value_to(self, "host")
             with ui.row():
                 ui.button(title, on_click=lambda: question.submit(True)).props("no-caps")
                 ui.button("Do nothing", color=None, on_click=question.close).props("flat no-caps")
@@ -217,6 +256,7 @@ class ProcessDialog(Dialog):
             with self._why:
                 ui.label(str(error)).classes("rosrm-bad")
             return
+        self.offer(found.get("possible") or EMPTY)
         with self._why:
             _show_explanation(found)
 
