@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -108,6 +109,23 @@ def test_the_wheel_zooms_and_the_picture_stops(page):
     page.mouse.move(area["x"] + area["width"] / 4, area["y"] + area["height"] / 3)
     page.mouse.wheel(0, -200)
     page.get_by_text("looking back").wait_for()
+
+
+def test_keys_zoom_and_shift_the_picture(page):
+    """Also where the pointer cannot: the length of the window is announced."""
+    picture = page.get_by_role("application", name="The keys + and - zoom")
+    picture.focus()
+    length = page.get_by_role("status").filter(has_text="min")
+    for key, shown in (("+", "2 min"), ("-", "5 min"), ("-", "10 min")):
+        page.keyboard.press(key)
+        length.filter(has_text=re.compile(f"^{shown}$")).wait_for()
+    page.keyboard.press("ArrowLeft")
+    page.get_by_text("looking back").wait_for()
+    for _ in range(2):  # time has passed since the shift to the left
+        page.keyboard.press("ArrowRight")
+    page.get_by_text("live", exact=True).wait_for()
+    page.get_by_role("button", name="Zoom in").click()
+    length.filter(has_text=re.compile("^5 min$")).wait_for()
 
 
 def test_a_name_narrows_the_picture(page):

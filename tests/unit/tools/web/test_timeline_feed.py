@@ -6,7 +6,7 @@ import asyncio
 
 from rosrm.model.rows import EventRow, Listing
 from rosrm_web.gateway import Gateway
-from rosrm_web.page.timeline_feed import Feed
+from rosrm_web.page.timeline_feed import FIRST, Feed
 from rosrm_web.watching import MOST_EVENTS
 from tests.unit.tools.report.runs import events
 
@@ -20,10 +20,11 @@ class Master:
         )
         self.reads = 0
 
-    def list(self, *, events: bool = False, after: int = 0, **_) -> Listing:
+    def list(self, *, events: bool = False, after: int = 0, newest: int = 0, **_) -> Listing:
         self.reads += events
         last = self.rows[-1].sequence
-        return Listing("m", 1.0, last, events=[one for one in self.rows if one.sequence > after])
+        rows = [one for one in self.rows if one.sequence > after][-(newest or 1000) :]
+        return Listing("m", 1.0, last, events=rows)
 
     def master_load(self):
         """Return nothing: no load was published."""
@@ -94,6 +95,22 @@ def test_events_of_a_new_journal_replace_those_of_the_former():
         master.rows.append(row(2, "newer"))
         await gateway.watcher.look()
         assert (placements(feed), feed.newest) == (["new", "newer"], 2)
+        gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_older_events_are_read_on_request():
+    """The first reading is short; a user may ask for all that the master sends."""
+
+    async def scene() -> None:
+        master, gateway, feed = await started()
+        master.rows += [row(3 + number, "late") for number in range(FIRST)]
+        await gateway.watcher.look()
+        await feed.read()
+        assert ("p" in placements(feed), feed.has_older) == (False, True)
+        await feed.read_older()
+        assert ("p" in placements(feed), feed.has_older) == (True, False)
         gateway.close()
 
     asyncio.run(scene())

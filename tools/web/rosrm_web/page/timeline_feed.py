@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 from rosrm.errors import RosrmError
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Events that the first timeline begins with; the master reads them between its other tasks.
 FIRST: Final = 5000
+#: Most events that the master sends at once, which a user may ask for.
+MOST_READ: Final = 10_000
 #: Events that are kept while the gateway runs.
 MOST_KEPT: Final = 10_000
 
@@ -30,6 +33,7 @@ class Feed:
     Attributes:
         timeline: of the kept events.
         newest: sequence of the newest event; 0: none was read yet.
+        has_older: the master may send older events than those of the timeline.
     """
 
     def __init__(self, gateway: Gateway) -> None:
@@ -40,6 +44,8 @@ class Feed:
         self._reading = asyncio.Lock()
         self.timeline = Timeline()
         self.newest = 0
+        self.has_older = False
+        self._number = FIRST
         gateway.watcher.on_events.append(self.take)
         gateway.watcher.on_new_journal.append(self._forget)
 
@@ -49,11 +55,18 @@ class Feed:
             if self._is_whole:
                 return
             with suppress(RosrmError):  # the header says that the master is lost
-                rows = await self._gateway.ask(self._gateway.reading, _newest)
+                request = partial(_newest, number=self._number)
+                rows = await self._gateway.ask(self._gateway.reading, request)
                 self._is_whole = True
+                self.has_older = self._number < MOST_READ and len(rows) >= self._number
                 self._events.clear()
                 self._events.extend(map(_without_decision, rows))
                 self._begin_again()
+
+    async def read_older(self) -> None:
+        """Read as many events as the master sends."""
+        self._number, self._is_whole = MOST_READ, False
+        await self.read()
 
     def take(self, rows: Sequence[EventRow]) -> None:
         """Add new events; events of a burst may be missing, and then all are read again."""
@@ -70,7 +83,7 @@ class Feed:
 
     def _forget(self) -> None:
         """Drop all events; the next `read` has those of the new journal."""
-        self._is_whole, self.newest = False, 0
+        self._is_whole, self.newest, self._number = False, 0, FIRST
         self._events.clear()
         self._begin_again()
 
@@ -85,8 +98,8 @@ class Feed:
         self.newest, self._taken = row.sequence, self._taken + 1
 
 
-def _newest(client: Client) -> Sequence[EventRow]:
-    return client.list(events=True, newest=FIRST, on_wait=give_up_early).events
+def _newest(client: Client, number: int) -> Sequence[EventRow]:
+    return client.list(events=True, newest=number, on_wait=give_up_early).events
 
 
 def _without_decision(row: EventRow) -> EventRow:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from nicegui import background_tasks, ui
 
+from rosrm.wording import duration
 from rosrm_web.page import timeline_chart, views
 from rosrm_web.page.timeline import STYLES, Picture, View, picture
 
@@ -20,6 +21,17 @@ if TYPE_CHECKING:
     from rosrm_web.page.timeline_feed import Feed
 
 _WINDOWS: Final = {60.0: "1 min", 300.0: "5 min", 3600.0: "1 h", 86_400.0: "1 day"}
+#: Shortest and longest window, s, of the keys + and -.
+_SHORTEST, _LONGEST = 5.0, 7 * 86_400.0
+#: Parts of the window by which the arrow keys shift it, and factors of its length.
+_SHIFTS: Final = {"ArrowLeft": -0.25, "ArrowRight": 0.25}
+_FACTORS: Final = {"+": 0.5, "=": 0.5, "-": 2.0}
+_KEYS: Final = f"""(event) => {{
+  if ({[*_SHIFTS, *_FACTORS]}.includes(event.key) && !event.ctrlKey && !event.metaKey) {{
+    event.preventDefault();
+    emit(event.key);
+  }}
+}}"""
 #: Seconds after which states are drawn again without an event, e.g. of a host that is silent.
 _OLD: Final = 5.0
 STYLE: Final = f"""
@@ -63,8 +75,10 @@ class Timeline:
             timeline_chart.options(), renderer="svg", on_point_click=self._choose
         )
         self._chart.classes("w-full rosrm-timeline").props(
-            'role=img aria-label="Processes over hosts; a table below has its moves and faults"'
+            'role=application tabindex=0 aria-label="Processes over hosts. The keys + and - zoom, '
+            'the arrow keys shift. A table below has its moves and faults"'
         )
+        self._chart.on("keydown", lambda event: self._press(event.args), js_handler=_KEYS)
         self._chart.on("chart:datazoom", self._zoomed, js_handler=_ZOOM)
         with ui.row().classes("w-full items-center gap-x-3 gap-y-1"):
             self._summary = ui.label()
@@ -77,15 +91,19 @@ class Timeline:
 
     def _controls(self) -> None:
         with ui.row().classes("w-full items-center gap-2"):
-            ui.toggle(_WINDOWS, value=self._view.seconds, on_change=self._set_window).props(
-                'no-caps dense role=group aria-label="Window"'
-            )
+            self._windows = ui.toggle(
+                _WINDOWS, value=self._view.seconds, on_change=self._set_window
+            ).props('no-caps dense role=group aria-label="Window"')  # fmt: skip
             for title, act in (
+                ("Zoom in", partial(self._zoom, 0.5)), ("Zoom out", partial(self._zoom, 2.0)),
                 ("Earlier", partial(self._shift, -0.5)), ("Later", partial(self._shift, 0.5)),
                 ("Now", self._follow),
             ):  # fmt: skip
                 ui.button(title, on_click=act).props("dense no-caps").classes("px-2")
             self._state = ui.label("live").props("role=status")
+            self._length = ui.label(duration(self._view.seconds)).props("role=status")
+            self._older = ui.button("Older events", color=None, on_click=self._read_older)
+            self._older.props("outline dense no-caps").classes("px-2").set_visibility(False)
             for name in ("host", "application", "process"):
                 ui.input(name.capitalize(), on_change=partial(self._narrow, name)).props(
                     "dense clearable debounce=300"
@@ -104,7 +122,29 @@ class Timeline:
         self.update()
 
     def _set_window(self, event: Any) -> None:
-        self._look(replace(self._view, seconds=event.value))
+        if event.value:  # otherwise `_zoom` has chosen another length
+            self._look(replace(self._view, seconds=event.value))
+
+    def _press(self, key: str) -> None:
+        if key in _SHIFTS:
+            self._shift(_SHIFTS[key])
+        elif key in _FACTORS:
+            self._zoom(_FACTORS[key])
+
+    def _zoom(self, factor: float) -> None:
+        """Change the length of the window; in a look back the middle stays."""
+        view = self._view
+        seconds = min(max(factor * view.seconds, _SHORTEST), _LONGEST)
+        end = view.end
+        if end is not None:
+            now = self._feed.timeline.clock.wall_time(self._now())
+            end = min(end + (seconds - view.seconds) / 2, now)
+        self._look(replace(view, seconds=seconds, end=end))
+        self._windows.value = seconds if seconds in _WINDOWS else None
+
+    async def _read_older(self) -> None:
+        await self._feed.read_older()
+        self._draw()
 
     def _shift(self, share: float) -> None:
         end = self._end + share * self._view.seconds
@@ -137,6 +177,7 @@ class Timeline:
 
     def _show_state(self) -> None:
         self._state.text = "live" if self._view.end is None else "looking back"
+        self._length.text = duration(self._view.seconds)
 
     def _choose(self, event: EChartPointClickEventArguments) -> None:
         shape = event.value
@@ -174,6 +215,7 @@ class Timeline:
             name: round(1e3 * feed.timeline.clock.wall_time(seconds))
             for name, seconds in (("min", self._end - self._view.seconds), ("max", self._end))
         }
+        self._older.set_visibility(feed.has_older)
         options = self._chart.options
         options["xAxis"].update(edges)
         basis = (self._view, feed.newest, listing.last_sequence)
