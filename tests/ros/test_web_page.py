@@ -11,7 +11,11 @@ from typing import Any
 import pytest
 from axe_playwright_python.sync_playwright import Axe
 
+from rosrm.archive.layout import Source
+from rosrm.archive.retention import ArchiveLimits
+from rosrm.archive.writer import ArchiveWriter
 from rosrm.config.settings import MigrationSettings
+from rosrm.model.rows import LogPart
 from rosrm.model.values import MigrationPolicy
 from tests.ros.browser_kit import SLOW_LINK, open_tab, row, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
@@ -96,6 +100,24 @@ def test_a_process_opens_with_its_scores_and_its_log(page):
     dialog.get_by_label("Show only lines with").fill(f" {newest + 2}.")
     dialog.get_by_text(f"beat {newest + 1}.").wait_for(state="detached")
     assert lines.count() == later.count() == 1
+
+
+def test_a_collected_log_is_shown_where_its_host_is_gone(chromium, cluster, tmp_path):
+    """The dialog says where the output is from; HTML in it stays text."""
+    line = f"{HTML} motor stalled\n".encode()
+    writer = ArchiveWriter(tmp_path / "archive", ArchiveLimits(1 << 30, 1 << 30))
+    writer.add(Source("robot-9", "giant", 1), LogPart(1, (1,), line, 0, len(line), True, ()))
+    with (
+        gateway(cluster.ros, "--archive", str(tmp_path / "archive")) as web,
+        tab(chromium, web.url) as page,
+    ):
+        open_tab(page, "Processes")
+        row(page, "giant").dblclick()
+        dialog = page.get_by_role("dialog")
+        open_tab(dialog, "Logs")
+        dialog.get_by_text("Its output there is read from").wait_for()
+        dialog.get_by_text(f"{HTML} motor stalled").wait_for()
+        assert page.locator("img").count() == 0
 
 
 def test_a_change_appears_without_a_reload(page, cluster):
