@@ -257,6 +257,22 @@ def test_a_successor_can_be_succeeded(stage, pair, counter):
     assert third.count >= pair.counts[-1].data
 
 
+def test_a_shadow_with_a_state_takes_over_before_it_is_ready(stage, pair, monkeypatch):
+    """The shadow reports the sequence of its state, by which the master knows that it can."""
+    monkeypatch.setattr(pair.second.output, "get_subscription_count", lambda: 0)
+    pair.conductor.say(C.SHADOW)
+    stage.spin_until(
+        lambda: any(one.phase == R.SHADOWING and one.sequence for one in pair.conductor.reports),
+        "a report of the state",
+    )
+    stage.remove(pair.first)
+    pair.conductor.say(C.TAKE_OVER)
+    pair.conductor.wait(2, R.ACTIVE)
+    assert R.READY not in pair.conductor.of(2)
+    goes_on(stage, pair.counts)
+    assert is_gapless(pair.counts)
+
+
 @pytest.mark.parametrize(
     ("what", "method", "text"),
     [

@@ -257,7 +257,7 @@ class Destination:
         if not self._was_ready:
             missing = self._still_missing()
             if missing:
-                self._channel.report(HandoffReport.SHADOWING, 0, f"waits {missing}")
+                self._channel.report(HandoffReport.SHADOWING, self._sequence(), f"waits {missing}")
                 return
             self._was_ready = True
             self._channel.report(HandoffReport.READY, self._sequence())

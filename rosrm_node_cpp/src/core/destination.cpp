@@ -261,7 +261,7 @@ void Destination::review()
   if (!was_ready_) {
     const std::string missing = still_missing();
     if (!missing.empty()) {
-      channel_->report(Phase::kShadowing, 0, "waits " + missing);
+      channel_->report(Phase::kShadowing, sequence(), "waits " + missing);
       return;
     }
     was_ready_ = true;

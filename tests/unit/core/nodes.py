@@ -19,9 +19,10 @@ from rosrm.model.values import InstanceId
 if TYPE_CHECKING:
     from tests.unit.core.machine import Machine
 
-#: What a node may do wrong: it never answers; it says FAILED; as a destination it is never ready or
-#: does not answer to ABORT; as a source it never falls silent, or does not answer to RESUME.
-QUIRKS = ("deaf", "unfit", "never ready", "no abort", "never silent", "no resume")
+#: What a node may do wrong: it never answers; it says FAILED; as a destination it never receives a
+#: state, is never ready, or does not answer to ABORT; as a source it never falls silent, or does
+#: not answer to RESUME.
+QUIRKS = ("deaf", "unfit", "no state", "never ready", "no abort", "never silent", "no resume")
 
 
 @dataclass
@@ -57,9 +58,15 @@ class Node:
     def has_said(self, phase: ReportPhase) -> bool:
         return any(report.phase is phase for report in self.sent)
 
-    def say(self, phase: ReportPhase, message: str = "") -> None:
-        number = self.instance.number
-        report = HandoffReported(self.instance.process, self.handoff, number, phase, 7, message)
+    @property
+    def has_state(self) -> bool:
+        """Return True for a destination that has restored a state of the source."""
+        following = (ReportPhase.SHADOWING, ReportPhase.READY)
+        return any(report.sequence and report.phase in following for report in self.sent)
+
+    def say(self, phase: ReportPhase, message: str = "", sequence: int = 7) -> None:
+        name, number = self.instance.process, self.instance.number
+        report = HandoffReported(name, self.handoff, number, phase, sequence, message)
         self.sent.append(report)
         if self.air is not None:
             self.air.spread(self, report)
@@ -127,23 +134,29 @@ class Node:
         elif self.aborted:
             self.say(ReportPhase.ABORTED)
         elif phase is HandoffPhase.SHADOW:
-            self.say(ReportPhase.SHADOWING, "waits for input /scan")
+            self._shadow(sequence=7 if self.has_state else 0)
             self._maybe_ready()
         elif phase is HandoffPhase.SWITCH:
             self.switched = True
             self.say(ReportPhase.SWITCHING)
             self._maybe_active()
-        elif phase is HandoffPhase.TAKE_OVER and self.has_said(ReportPhase.READY):
+        elif phase is HandoffPhase.TAKE_OVER and self.has_state:
             self._become_active()
         elif phase is HandoffPhase.ABORT and "no abort" not in self.quirks:
             self.aborted = True
             self.say(ReportPhase.ABORTED)
 
+    def _shadow(self, sequence: int) -> None:
+        self.say(ReportPhase.SHADOWING, "waits for input /scan", sequence)
+
     def _maybe_ready(self) -> None:
-        if ReportPhase.ATTACHED not in self.heard or "never ready" in self.quirks:
+        if ReportPhase.ATTACHED not in self.heard or "no state" in self.quirks:
             return
         if "unfit" in self.quirks:
             self.say(ReportPhase.FAILED, "restore: KeyError: 'map'")
+        elif "never ready" in self.quirks:
+            if not self.has_state:
+                self._shadow(sequence=7)
         else:
             self.say(ReportPhase.READY)
 

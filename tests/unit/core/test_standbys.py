@@ -130,9 +130,18 @@ def test_the_standby_takes_over_when_the_primary_crashes(when: str) -> None:
     assert "takes over" in cluster.recorded("failed_over")[0]
 
 
-def test_a_standby_that_is_not_ready_does_not_take_over() -> None:
-    """The process is queued again, after the shadow was stopped."""
+def test_a_standby_with_a_state_takes_over_before_it_is_ready() -> None:
+    """Each snapshot is older, and a reader that ended with the primary would delay it for long."""
     cluster = with_standby(quirk="never ready", host_loss=HostLossPolicy("elsewhere"))
+    assert not cluster.recorded("standby_ready")
+    lose(cluster, "a")
+    assert (cluster.phase("p"), cluster.active(), cluster["p"].owner) == ("running", ["a", "b"], 2)
+    assert "takes over" in cluster.recorded("failed_over")[0]
+
+
+def test_a_standby_without_a_state_does_not_take_over() -> None:
+    """The process is queued again, after the shadow was stopped."""
+    cluster = with_standby(quirk="no state", host_loss=HostLossPolicy("elsewhere"))
     lose(cluster, "a")
     assert (cluster.phase("p"), cluster.active()) == ("running", ["a", "b"])
     assert cluster["p"].owner == cluster.machines["b"].find("p").number

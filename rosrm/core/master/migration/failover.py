@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.state.migration import End
+from rosrm.core.master.state.migration import End, HandoffReports
 from rosrm.core.master.state.process import DesiredState, PendingAmendment, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Step
@@ -29,26 +29,43 @@ def index_of(phase: HandoffPhase, steps: Sequence[Step]) -> int:
 
 
 def is_ready(state: MasterState, process: Process) -> bool:
-    """Return True if a process has a standby that could take over now."""
+    """Return True if a process has a standby that could take over now without loss."""
+    reports = _reports_of_standby(state, process)
+    return reports is not None and ReportPhase.READY in reports.phases
+
+
+def _has_state(state: MasterState, process: Process) -> bool:
+    """Return True if a process has a standby with a state of its primary, ready or not.
+
+    Without its primary such a standby becomes no readier, and each snapshot is older than its
+    state. It may still wait for a peer that ended with the primary.
+    """
+    reports = _reports_of_standby(state, process)
+    return reports is not None and reports.sequence > 0
+
+
+def _reports_of_standby(state: MasterState, process: Process) -> HandoffReports | None:
+    """Return the reports of the standby that follows the owner of a process; None: none does."""
     standby = state.standbys.get(process.name)
     if standby is None or standby.source.number != process.owner:
-        return False
+        return None
     if process.wanted is DesiredState.CANCEL:
-        return False
-    reported = standby.phases_of(standby.destination)
+        return None
+    reports = standby.handoff_reports.get(standby.destination.number)
     instance = state.instances.get(standby.destination.number)
-    follows = ReportPhase.READY in reported and not reported.keys() & _NOT_FOLLOWING
-    return follows and instance is not None and not instance.stopping
+    if reports is None or instance is None or instance.stopping:
+        return None
+    return None if reports.phases.keys() & _NOT_FOLLOWING else reports
 
 
 def take_over(state: MasterState, process: Process, end: End, now: float) -> bool:
     """Resume the migration of a standby whose primary has ended.
 
     Returns:
-        False: no standby could take over, or the primary has completed as intended.
+        False: no standby has the state, or the primary has completed as intended.
     """
     succeeded = end.status.succeeded and not end.ordered and not end.gone
-    if succeeded or not is_ready(state, process):
+    if succeeded or not (is_ready(state, process) or _has_state(state, process)):
         return False
     migration = state.standbys.pop(process.name)
     migration.ended[migration.source.number] = end

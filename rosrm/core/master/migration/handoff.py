@@ -175,6 +175,7 @@ def _note(
             facts={"phase": event.phase.name, "sequence": event.sequence},
         )  # fmt: skip
     reports.phases[event.phase] = reports.message = event.message
+    reports.sequence = max(reports.sequence, event.sequence)
 
 
 def is_active(state: MasterState, migration: Migration) -> bool:

@@ -40,10 +40,12 @@ class HandoffReports:
     Attributes:
         phases: reported phase to its newest message.
         message: newest message of all phases.
+        sequence: cycles that the newest reported state covers.
     """
 
     phases: dict[ReportPhase, str] = field(default_factory=dict)
     message: str = ""
+    sequence: int = 0
 
 
 @dataclass(slots=True)
