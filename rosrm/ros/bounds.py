@@ -150,11 +150,13 @@ def _size(message: Any) -> int:
     for field, entries, letters, nested in bounds_of(kind):
         value = getattr(message, field)
         if entries:
-            _check(kind, field, "entries", len(value), entries)
+            if len(value) > entries:
+                raise _beyond(kind, field, "entries", len(value), entries)
             size += len(value)
         if letters:
             for text in value if entries else (value,):
-                _check(kind, field, "letters", len(text), letters)
+                if len(text) > letters:
+                    raise _beyond(kind, field, "letters", len(text), letters)
                 size += len(text)
         elif nested:
             for part in value if entries else (value,):
@@ -162,6 +164,5 @@ def _size(message: Any) -> int:
     return size
 
 
-def _check(kind: type[Any], field: str, what: str, given: int, most: int) -> None:
-    if given > most:
-        raise Refused(f"{kind.__name__}.{field} has {given} {what}; at most {most}")
+def _beyond(kind: type[Any], field: str, what: str, given: int, most: int) -> Refused:
+    return Refused(f"{kind.__name__}.{field} has {given} {what}; at most {most}")

@@ -147,12 +147,15 @@ def _unchanged(value: Any) -> Any:
 
 def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
     """Return a dataclass as a message of a type with the same fields; `others` are converted."""
-    same = {
-        there: convert(getattr(value, name))
-        for name, there, convert, _ in _known_fields(type(value))
-        if there not in others
-    }
-    return message(**same, **others)
+    # Not by the constructor, which makes all nested messages with their defaults first.
+    made = message.__new__(message)
+    made._check_fields = False  # noqa: SLF001 - as the constructor does
+    for name, there, convert, _ in _known_fields(type(value)):
+        if there not in others:
+            setattr(made, there, convert(getattr(value, name)))
+    for there, converted in others.items():
+        setattr(made, there, converted)
+    return made
 
 
 def _from_msg(wanted: type[_Value], message: Any, /, **others: Any) -> _Value:

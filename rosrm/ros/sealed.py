@@ -15,7 +15,7 @@ from typing import Any, Final, Generic, TypeVar
 from weakref import WeakKeyDictionary
 
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.serialization import serialize_message
 
 from rosrm.errors import Refused
 from rosrm.keys.links import SealedMessage
@@ -23,7 +23,7 @@ from rosrm.keys.roles import may_send
 from rosrm.keys.sealing import FORMAT, channel_of
 from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
 from rosrm.keys.tickets import Ticket
-from rosrm.ros import qos
+from rosrm.ros import cdr, qos
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.ros.sealed_codec import MOST_LETTERS, Envelope, decode, encode
@@ -94,8 +94,11 @@ def _sealed_part(envelope: Envelope) -> SealedMessage:
 
 
 def _plain(kind: Any, content: bytes) -> Any:
-    """Return a message from its CDR form; raise `Refused` if it exceeds its bounds."""
-    message = deserialize_message(content, kind)
+    """Return a message from its CDR form; raise `Refused` if it is malformed or too large."""
+    try:
+        message = cdr.read(kind, content)
+    except ValueError as fault:
+        raise Refused(f"a malformed {kind.__name__}: {fault}") from None
     check_bounds(message)
     return message
 
