@@ -48,7 +48,7 @@ def security_mode(cluster: str | os.PathLike[str] | None = None) -> SecurityMode
     Raises:
         ConfigError: the file is invalid, or the variable has a value that is not allowed.
     """
-    from rosrm.config.settings import default_security  # noqa: PLC0415 - as `load_cluster`
+    from rosrm.keys.roles import default_security  # noqa: PLC0415 - only where ROS is used
 
     config = _cluster_file(cluster)
     return default_security() if config is None else config.security

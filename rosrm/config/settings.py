@@ -13,7 +13,7 @@ import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.device_forms import OfferedByKind, with_kinds
 from rosrm.config.markers import (
@@ -36,7 +36,7 @@ from rosrm.extensions.units import (
     Quantity,
     Seconds,
 )
-from rosrm.keys.roles import SecurityMode
+from rosrm.keys.roles import SecurityMode, default_security
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.values import EMPTY, ProcessSpec
@@ -52,7 +52,6 @@ _CORE: Final = CoreSettings()
 Options = Annotated[Mapping[str, Any], NullIsEmpty()]
 Ros = Annotated[RosSettings, RosSection()]
 Scope = Literal["machine", "cgroup", "slice"]
-Word = TypeVar("Word", bound=str)
 
 
 def default_state(name: str, role: str) -> Path:
@@ -67,25 +66,11 @@ def default_scope() -> Scope:
     Raises:
         ConfigError: the variable has a value that is not allowed.
     """
-    words: Mapping[str, Scope] = {"machine": "machine", "cgroup": "cgroup"}
-    return _word_in("ROSRM_SCOPE", words, "machine")
-
-
-def default_security() -> SecurityMode:
-    """Return the default of `security`: ROSRM_SECURITY, or else "keys".
-
-    Raises:
-        ConfigError: the variable has a value that is not allowed.
-    """
-    words: Mapping[str, SecurityMode] = {"keys": "keys", "none": "none"}
-    return _word_in("ROSRM_SECURITY", words, "keys")
-
-
-def _word_in(variable: str, words: Mapping[str, Word], default: Word) -> Word:
-    text = os.environ.get(variable, "") or default
-    if text not in words:
-        raise ConfigError(f"{variable}={text!r}; allowed: {', '.join(words)}")
-    return words[text]
+    scopes: Mapping[str, Scope] = {"machine": "machine", "cgroup": "cgroup"}
+    text = os.environ.get("ROSRM_SCOPE") or "machine"
+    if text not in scopes:
+        raise ConfigError(f"ROSRM_SCOPE={text!r}; allowed: {', '.join(scopes)}")
+    return scopes[text]
 
 
 # --- cluster.yaml -----------------------------------------------------------------------------

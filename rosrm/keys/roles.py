@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,6 +18,19 @@ _NAME: Final = re.compile(r"[A-Za-z0-9_.~/@-]{1,128}")
 
 #: Setting `security` of a cluster.
 SecurityMode = Literal["keys", "none"]
+
+
+def default_security() -> SecurityMode:
+    """Return the default of `security`: ROSRM_SECURITY, or else "keys".
+
+    Raises:
+        ConfigError: the variable has a value that is not allowed.
+    """
+    modes: Mapping[str, SecurityMode] = {"keys": "keys", "none": "none"}
+    text = os.environ.get("ROSRM_SECURITY") or "keys"
+    if text not in modes:
+        raise ConfigError(f"ROSRM_SECURITY={text!r}; allowed: {', '.join(modes)}")
+    return modes[text]
 
 
 class Role(str, Enum):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import json
 import logging
 import os
@@ -60,7 +59,7 @@ from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
-from rosrm.runtime.bootstrap import handle_signals
+from rosrm.runtime.bootstrap import end_start, handle_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.runtime.worker import Worker
 from rosrm.version import __version__
@@ -75,9 +74,6 @@ _TICK: Final = 0.05
 _SOON: Final = 0.005
 #: Seconds for the discovery of another running master.
 _DISCOVERY: Final = 1.0
-#: Thresholds of the garbage collector; with Python's defaults a burst of submissions takes a third
-#: longer.
-_COLLECT_AT: Final = (10_000, 20, 20)
 #: Seconds within which two starts of masters count as simultaneous.
 _AT_ONCE: Final = 1.0
 #: Seconds of plugin calls in one turn; beyond this limit the core's clock is set back by them.
@@ -292,10 +288,7 @@ class MasterRuntime:
 
     def run(self) -> int:
         """Serve until a signal to stop; returns the exit code."""
-        # Exclude all objects of the start from garbage collection, because they stay.
-        gc.collect()
-        gc.freeze()
-        gc.set_threshold(*_COLLECT_AT)
+        end_start()
         next_tick = next_beat = self._now()
         with self._closing:
             while not self._stopping:

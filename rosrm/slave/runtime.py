@@ -54,7 +54,7 @@ from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
-from rosrm.runtime.bootstrap import handle_signals
+from rosrm.runtime.bootstrap import end_start, handle_signals
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.artifacts.service import ArtifactService
@@ -343,6 +343,7 @@ class SlaveRuntime:
         return self._endpoint.link is MasterLink.REGISTERED
 
     def _serve(self, condition: Callable[[], bool]) -> None:
+        end_start()
         now = time.monotonic()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
         next_sample = next_usage = next_graph = next_health = next_devices = now

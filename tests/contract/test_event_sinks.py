@@ -9,7 +9,8 @@ from rosrm import RosrmError
 from rosrm.testing import EventSinkContract
 from rosrm_alerts import plugin
 from rosrm_alerts.sinks.command import Command, CommandOptions
-from rosrm_alerts.sinks.webhook import Webhook, WebhookOptions
+from rosrm_alerts.sinks.webhook import Webhook
+from rosrm_alerts.sinks.webhook_options import WebhookOptions
 from tests.webhook_kit import Receiver
 
 OFFERS = {offer.name: offer for offer in plugin.register_event_sinks()}

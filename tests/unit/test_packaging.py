@@ -110,7 +110,7 @@ def test_the_readme_installs_all_that_runs() -> None:
 ALONE = """
 import sys
 sys.modules.update(dict.fromkeys({absent!r}))
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 app(["--help"])
 """
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
-from rosrm.config.settings import default_security
 from rosrm.errors import ConfigError
 from rosrm.keys import key_files
 from rosrm.keys.cluster import OWN, PrincipalKey, Principals
+from rosrm.keys.roles import default_security
 from rosrm.wording import counted
 
 _NOT_PROTECTED: Final = (

@@ -6,11 +6,29 @@ Names, reasons and messages come from other hosts and other users. Tables go thr
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import typer
 
+from rosrm.cli.process import INTERRUPTED
+from rosrm.errors import RosrmError
 from rosrm.wording import printable
 
 
 def echo(text: str, *, err: bool = False) -> None:
     """Print a line to standard output, or to standard error."""
     typer.echo(printable(text), err=err)
+
+
+@contextmanager
+def errors_reported() -> Iterator[None]:
+    """Turn an error of rosrm, and Ctrl-C, into a message and the exit code of the process."""
+    try:
+        yield
+    except RosrmError as error:
+        echo(f"rosrm: {error}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(INTERRUPTED)

@@ -7,7 +7,8 @@ import pytest
 from rosrm import Notice
 from rosrm_alerts.delivery import Delivery
 from rosrm_alerts.outbox import Outbox, OutboxError
-from rosrm_alerts.sinks.webhook import Webhook, WebhookOptions
+from rosrm_alerts.sinks.webhook import Webhook
+from rosrm_alerts.sinks.webhook_options import WebhookOptions
 from rosrm_alerts.watch import Subject
 from tests.waiting import wait_until
 from tests.webhook_kit import Receiver

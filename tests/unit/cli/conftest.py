@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rosrm.cli import connection
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
 

@@ -13,7 +13,7 @@ import pytest
 import typer
 
 from rosrm.cli import groups
-from rosrm.cli.commands import app, keep_only
+from rosrm.cli.command_tree import app, keep_only
 from rosrm.version import PROTOCOL_VERSION, __version__
 
 
@@ -85,7 +85,7 @@ def test_the_help_of_a_group_cuts_no_summary_off(rosrm, group):
 def test_help_imports_neither_ros_nor_pydantic_nor_numpy():
     """`rosrm --help` is quick because no command imports at once what it needs when it runs."""
     code = (
-        "import sys; from rosrm.cli.commands import app\n"
+        "import sys; from rosrm.cli.command_tree import app\n"
         "try: app(['--help'])\n"
         "except SystemExit: print(*sorted("
         "{'rclpy', 'pydantic', 'yaml', 'numpy', 'rosrm.ros.master_connection', 'rosrm_lab.lab'}"
@@ -136,11 +136,11 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
     """Exit with 1, in silence for a closed pipe; `write` leaves its output to the exit."""
     code = (
         "import sys, types\n"
-        "from rosrm.cli import commands\n"
+        "from rosrm.cli import command_tree\n"
         "from rosrm.cli.output import tables\n"
-        "@commands.app.command()\n"
+        "@command_tree.app.command()\n"
         "def show(): tables.show('some')\n"
-        "@commands.app.command()\n"
+        "@command_tree.app.command()\n"
         "def write(): sys.stdout.write('some')\n"
         f"if {ros}: sys.modules['rclpy'] = types.ModuleType('rclpy')\n"
         f"sys.argv = ['rosrm', {command!r}]\n"
@@ -199,8 +199,8 @@ def test_no_file_takes_the_number_of_a_closed_standard_stream():
     """Output of a library to standard output is dropped, and not written into that file."""
     code = (
         "import os, sys\n"
-        "from rosrm.cli import commands\n"
-        "@commands.app.command()\n"
+        "from rosrm.cli import command_tree\n"
+        "@command_tree.app.command()\n"
         "def show():\n"
         "    file = os.open(os.devnull, os.O_RDONLY)\n"
         "    assert file > 2\n"

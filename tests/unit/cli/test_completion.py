@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from rosrm.cli import completion, early
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 from rosrm.client import connecting
 from rosrm.errors import ConfigError, NoMaster
 

@@ -13,7 +13,7 @@ import pytest
 from typer.main import get_command
 
 from rosrm.cli import connection, early
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 from rosrm.errors import NoMaster, RosrmError
 from rosrm.keys.security import NoSecurity
 from rosrm.model.ros_settings import RosSettings

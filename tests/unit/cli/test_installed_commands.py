@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rosrm.cli import commands
+from rosrm.cli import command_tree
 
 #: Module with a function, a group, and objects that are no commands.
 MODULE = '''
@@ -160,7 +160,7 @@ def test_a_misspelt_command_of_another_distribution_is_hinted_at(rosrm, installe
 )
 def test_a_command_whose_distribution_is_absent_names_it(rosrm, monkeypatch, command, distribution):
     """A command of this repository that is not installed says in one sentence where it is."""
-    monkeypatch.setattr(commands, "find_commands", dict)
+    monkeypatch.setattr(command_tree, "find_commands", dict)
 
     result = rosrm(command, "up", "--help")
 
@@ -174,6 +174,6 @@ def test_a_command_of_rosrm_is_found_without_a_search(rosrm, monkeypatch):
     def search():
         raise AssertionError("no search is needed")
 
-    monkeypatch.setattr(commands, "find_commands", search)
+    monkeypatch.setattr(command_tree, "find_commands", search)
 
     assert rosrm("ps", "--help").code == 0

@@ -13,7 +13,7 @@ import typer.main
 import yaml
 from typer.testing import CliRunner
 
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 from rosrm.cli.groups import DISTRIBUTIONS
 from rosrm.extensions.registry import Registry
 from rosrm.ros import names

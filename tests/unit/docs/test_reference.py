@@ -14,7 +14,7 @@ import pytest
 import typer.main
 
 import rosrm
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 from rosrm.cli.groups import DISTRIBUTIONS
 from rosrm.config.cluster import load_cluster
 from rosrm.config.groups import GroupInFile

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rosrm import EventSink, SinkOffer, hookimpl
 from rosrm_alerts.sinks.command import Command, CommandOptions
 from rosrm_alerts.sinks.mcap_file import McapFile, McapOptions
-from rosrm_alerts.sinks.webhook import Webhook, WebhookOptions
+from rosrm_alerts.sinks.webhook_options import WebhookOptions
 
 
 @hookimpl
@@ -27,6 +27,8 @@ def register_event_sinks() -> Sequence[SinkOffer]:
 
 
 def _webhook(options: WebhookOptions) -> EventSink:
+    from rosrm_alerts.sinks.webhook import Webhook  # noqa: PLC0415 - the HTTP client
+
     return Webhook(options)
 
 

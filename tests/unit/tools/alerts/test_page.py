@@ -5,7 +5,7 @@ from pathlib import Path
 
 from typer.testing import CliRunner
 
-from rosrm.cli.commands import app
+from rosrm.cli.command_tree import app
 
 PAGE = Path(__file__).resolve().parents[4] / "docs/how-to/alerts.md"
 

@@ -6,38 +6,16 @@ import json
 import urllib.error
 import urllib.request
 from collections.abc import Sequence
-from dataclasses import dataclass
 from http.client import HTTPException
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-from rosrm import ConfigError, Notice, NoticesRefused, PositiveSeconds, RosrmError
+from rosrm import ConfigError, Notice, NoticesRefused, RosrmError
+from rosrm_alerts.sinks.webhook_options import WebhookOptions
 
 #: Answers after which a repetition of the request may succeed, besides all of 500 and above.
 _TRANSIENT: Final = (408, 425, 429)
-
-
-@dataclass(frozen=True)
-class WebhookOptions:
-    """Options of the sink.
-
-    Attributes:
-        url: http or https address.
-        headers: path of a file with further headers, a line `Name: value` each, for example with a
-            token; "": none.
-        timeout: seconds for one request.
-    """
-
-    url: str = ""
-    headers: str = ""
-    timeout: PositiveSeconds = 10.0
-
-    def __post_init__(self) -> None:
-        """Refuse other schemes; raises `ValueError`."""
-        parts = urlsplit(self.url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError(f"url: {self.url!r} is no address, such as https://example.com/hook")
 
 
 class Webhook:
