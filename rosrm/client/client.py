@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from rosrm.archive.reader import LogArchive
     from rosrm.client.logs import LogChunk, LogReader, LogSelection
+    from rosrm.client.start_traces import Trace
     from rosrm.client.waiting import OnChange, Until, WaitResult
     from rosrm.model.applications import ApplicationRow, ApplyResult
     from rosrm.model.modes import ModeRow
@@ -95,6 +96,25 @@ class Client:
                 queued.
         """
         return self._master.submit(self._sent(_specs(work)))
+
+    def submit_traced(
+        self, work: Work | Iterable[Work], *, timeout: float | None = None
+    ) -> Mapping[str, Trace]:
+        """Queue processes as `submit` does; return the trace of the start of each, by its name.
+
+        A trace maps each hand-over to its unix time in nanoseconds, by the clock of its machine.
+
+        Args:
+            work: as for `submit`.
+            timeout: seconds for the starts; None: no limit.
+
+        Raises:
+            RosrmError: a process was not started in time; the processes stay queued or run.
+        """
+        from rosrm.client.start_traces import submit_traced  # noqa: PLC0415 - only for traces
+
+        specs = self._sent(_specs(work))
+        return submit_traced(self._master, specs, timeout=timeout, notify=self._notify)
 
     def _sent(self, specs: Sequence[ProcessSpec]) -> Sequence[ProcessSpec]:
         """Send the contents of artifacts to the master; return the specs with the digests."""

@@ -20,6 +20,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.cli.ros2_verb import complete
+from rosrm.client.start_traces import BESIDE, STAMPS
 from rosrm.testing.local_cluster import claim_domain
 from tests.ros.clusters import alive, host, wait_until_none
 from tests.waiting import PATIENCE, quickest, wait_gone, wait_until
@@ -345,6 +346,23 @@ def test_following_a_log_to_its_end(rosrm, cluster) -> None:
 
 
 # --- actions ----------------------------------------------------------------------------------
+
+
+def test_a_traced_submission_shows_its_hand_overs_in_order(rosrm) -> None:
+    """Each part adds its stamps: client, master, slave, supervisor, and the process itself."""
+    stamp = "processes: [{name: stamp, kind: job, command: [date, +%s%N]}]"
+    work = rosrm.file("stamp.work.yaml", stamp)
+    (trace,) = json.loads(rosrm.run("submit", work, "--trace", "--json", "--timeout", "30s"))
+    stamps = trace["stamps"]
+    assert trace["process"] == "stamp"
+    assert stamps.keys() == STAMPS.keys() | BESIDE.keys()
+    in_order = [stamps[name] for name in STAMPS]
+    assert in_order == sorted(in_order)
+    assert stamps["recorded"] <= stamps["spawned"]
+    assert stamps["master_received"] <= stamps["client_answered"]
+    steps = [row["step_ms"] for row in trace["hand_overs"] if row["step_ms"] is not None]
+    assert len(steps) == len(STAMPS) - 1
+    assert sum(steps) == pytest.approx((in_order[-1] - in_order[0]) / 1e6)
 
 
 def test_a_name_in_use(rosrm) -> None:

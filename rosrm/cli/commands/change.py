@@ -40,12 +40,24 @@ def submit(
             metavar="WORK...", help="work.yaml: the processes to run; - is the standard input."
         ),
     ],
+    *,
     wait: Annotated[
         bool,
         typer.Option(
             "--wait",
             help="Wait until each job has ended and each service runs; exit 1 if one does not.",
         ),
+    ] = False,
+    trace: Annotated[
+        bool,
+        typer.Option(
+            "--trace",
+            help="Wait for the start of each process, and show its hand-overs: when each part "
+            "received it and passed it on.",
+        ),
+    ] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="With --trace: print JSON instead of tables.")
     ] = False,
     timeout: Timeout = "",
     domain: Domain = None,
@@ -57,12 +69,21 @@ def submit(
     from rosrm.cli.waiting import interruptible, longest, show_change, show_processes
     from rosrm.config.work import load_work
 
+    if as_json and not trace:
+        raise ConfigError("submit: --json is for the output of --trace; add --trace, or omit it")
     limit = longest(timeout)
     specs = [spec for file in files for spec in load_work(file)]
+    left = "the submitted processes stay queued or run (`rosrm ps`)"
     with connection.master(ctx, domain) as client:
-        echo(client.submit(specs))
+        if trace:
+            from rosrm.cli.output import start_traces
+
+            with interruptible(left):
+                start_traces.show(client.submit_traced(specs, timeout=limit), as_json=as_json)
+        else:
+            echo(client.submit(specs))
         if wait:
-            with interruptible("the submitted processes stay queued or run (`rosrm ps`)"):
+            with interruptible(left):
                 names = [spec.name for spec in specs]
                 show_processes(client.wait(names, timeout=limit, on_change=show_change))
 

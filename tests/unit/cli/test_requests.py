@@ -103,6 +103,13 @@ def test_submit_sends_every_process_of_the_file(rosrm, client, work):
     assert client.asked == [("submit", ["a", "b"])]
 
 
+def test_submit_json_without_a_trace_is_refused(rosrm, client, work):
+    """A submission has no other output that could be JSON."""
+    result = rosrm("submit", work, "--json")
+    assert (result.code, client.asked) == (2, [])
+    assert "--json is for the output of --trace" in result.err
+
+
 def test_submit_refuses_a_wrong_file_before_it_looks_for_a_master(rosrm, client, tmp_path):
     (tmp_path / "w.yaml").write_text("processes: [{name: a, comand: x}]", encoding="utf-8")
     result = rosrm("submit", tmp_path / "w.yaml")
