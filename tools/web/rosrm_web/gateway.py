@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import wait
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from rosrm.archive.reader import LogArchive
 from rosrm.errors import NoMaster
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from rosrm.model.rows import Listing
 
 T = TypeVar("T")
+
+#: Seconds for which the end waits for present requests.
+_LEAVING: Final = 5.0
 
 
 class Gateway:
@@ -81,6 +85,9 @@ class Gateway:
             raise NoMaster(self.watcher.master.reason)
 
     def close(self) -> None:
-        """Leave ROS."""
-        for link in (self.reading, self.acting, self.logs):
-            link.close()
+        """Leave ROS, as far as the present requests end in time.
+
+        Otherwise the shared memory of the clients would remain after the end of this process.
+        """
+        left = [link.close() for link in (self.reading, self.acting, self.logs)]
+        wait(left, _LEAVING)

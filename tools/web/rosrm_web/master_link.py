@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rosrm.errors import RosrmError
@@ -68,10 +68,11 @@ class MasterLink:
         self.notes.append(text)
         _log.info("%s", text)
 
-    def close(self) -> None:
-        """Leave ROS after the present request; drop the waiting ones."""
-        self._executor.submit(self._leave)
+    def close(self) -> Future[None]:
+        """Leave ROS after the present and the waiting requests; return that end."""
+        left = self._executor.submit(self._leave)
         self._executor.shutdown(wait=False)
+        return left
 
     def _leave(self) -> None:
         if self._client is not None:

@@ -1,4 +1,4 @@
-"""The watcher of the master continues after any failure of a reader of its events."""
+"""The watcher of the master outlives failures of its readers, and its client leaves in the end."""
 
 from __future__ import annotations
 
@@ -74,5 +74,30 @@ def test_a_gateway_with_too_many_requests_does_not_count_its_master_as_lost():
         free.set()
         assert all(await asyncio.gather(*waiting))
         gateway.close()
+
+    asyncio.run(scene())
+
+
+def test_the_end_waits_until_the_client_has_left():
+    """The command then ends without the interpreter's own end, and so without waiting threads."""
+    asked, ended, left = threading.Event(), threading.Event(), threading.Event()
+
+    class Late(Master):
+        def list(self, **_):
+            asked.set()
+            assert ended.wait(30.0)
+            return super().list()
+
+        def close(self):
+            left.set()
+
+    async def scene() -> None:
+        gateway = Gateway(lambda _: Late())
+        watching = asyncio.create_task(gateway.watcher.run())
+        assert await asyncio.to_thread(asked.wait, 30.0)
+        watching.cancel()
+        threading.Timer(0.2, ended.set).start()
+        gateway.close()
+        assert left.is_set()
 
     asyncio.run(scene())
