@@ -68,6 +68,7 @@ from rosrm_examples.migration_job import (
 from rosrm_examples.migration_results import LiveRun, differences, summarise, unmigrated_poses
 from rosrm_examples.observer import Observer
 from rosrm_examples.picture import Stretch, draw_errors, draw_stretches
+from rosrm_examples.played_drive import add_rate
 from rosrm_examples.ply import write_ply
 from rosrm_examples.slam_state import STATES
 
@@ -104,19 +105,8 @@ def _parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument(
         "--state", choices=sorted(STATES), default="full", help="what moves (default: full)"
     )
-    parser.add_argument(
-        "--rate",
-        type=_rate,
-        help="times as fast as it was driven (default: 1, or less, for 20 s in all)",
-    )
+    add_rate(parser, "1, or less, for 20 s in all")
     return parser.parse_args(arguments)
-
-
-def _rate(text: str) -> float:
-    rate = float(text)
-    if not 0.05 <= rate <= 20:
-        raise argparse.ArgumentTypeError(f"{text} is not within 0.05 to 20")
-    return rate
 
 
 def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:

@@ -31,8 +31,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
-
 from rosrm.testing.local_cluster import LocalCluster
 from rosrm_examples.demo_frame import (
     CLUSTER,
@@ -53,11 +51,11 @@ from rosrm_examples.drives import load_drive
 from rosrm_examples.map_part import load_parts
 from rosrm_examples.migration_results import LiveRun, differences, summarise, unmigrated_poses
 from rosrm_examples.observer import Observer
+from rosrm_examples.played_drive import PlayedDrive, add_rate
 from rosrm_examples.rollout_job import (
     BUDGET,
     HANDOFFS,
     HOST,
-    LiveRollout,
     RolloutScript,
     cluster_config,
     host_config,
@@ -75,9 +73,9 @@ _PLAYED: Final = "player.json"
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the demo; return the exit status."""
-    options = demo_parser(
-        "demo_rollout", "An application gets new versions while it maps a drive."
-    ).parse_args(arguments)
+    parser = demo_parser("demo_rollout", "An application gets new versions while it maps a drive.")
+    add_rate(parser, "1")
+    options = parser.parse_args(arguments)
     return run_demo("demo_rollout", options.out, lambda stage: _demonstrate(options, stage))
 
 
@@ -85,8 +83,9 @@ def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
     if free_memory() < BUDGET:
         raise Unfit(f"less than {BUDGET / 2**20:.0f} MiB of memory are free here")
     out: Path = options.out
-    live = LiveRollout(
+    live = PlayedDrive(
         drive=load_drive(options.drive or DRIVE),
+        rate=options.rate or 1.0,
         out=(out / _PARTS).absolute(),
         report=(out / _PLAYED).absolute(),
         working_directory=Path.cwd(),
@@ -104,7 +103,7 @@ def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
         raise DemoFailed(f"{'; '.join(wrong)}; see the logs in {out / CLUSTER}")
 
 
-def _carry_out(live: LiveRollout, record: Record, directory: Path, stage: Stage) -> LiveRun:
+def _carry_out(live: PlayedDrive, record: Record, directory: Path, stage: Stage) -> LiveRun:
     """Play and map the drive on a cluster; return the observations."""
     cluster = LocalCluster(directory, cluster_config(), [host_config(os.cpu_count() or 1)])
     with closing(Observer(cluster.ros)) as observer:
@@ -113,8 +112,7 @@ def _carry_out(live: LiveRollout, record: Record, directory: Path, stage: Stage)
         Demo(cluster, record, screen, stage.signals).carry_out(script)
         received = list(observer.received)
     sent = int(json.loads(live.report.read_text())["scans_sent"])
-    period = float(np.median(np.diff(live.drive.times)))
-    return LiveRun(live.drive, sent, received, load_parts(live.out), period)
+    return LiveRun(live.drive, sent, received, load_parts(live.out), live.period)
 
 
 def _write_results(out: Path, run: LiveRun, record: Record) -> dict[str, Any]:

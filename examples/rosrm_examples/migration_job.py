@@ -8,22 +8,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Final
 
-import numpy as np
-
-from rosrm import Client, Kind, Listing, MigrationPolicy, ProcessRow, ProcessSpec
+from rosrm import Client, Listing, MigrationPolicy, ProcessRow, ProcessSpec
 from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings, ScoringChoice
 from rosrm_examples.demo_job import MEMORY_LIMIT, NODE_STOP
 from rosrm_examples.demo_progress import Progress
 from rosrm_examples.demo_record import ENDED
 from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
+from rosrm_examples.played_drive import PLAYER, PlayedDrive
 
 #: The SLAM begins on the first; the player stays on the last.
 HOSTS: Final = ("host1", "host2", "robot")
-SLAM, PLAYER, RECORDER = "slam", "player", "recorder"
+SLAM, RECORDER = "slam", "recorder"
 #: Bytes of memory in the budgets of host1 and host2, and of the robot.
 BUDGET: Final = 448 * 2**20
 _ROBOT_BUDGET: Final = 160 * 2**20
@@ -45,29 +43,14 @@ _RECORDER_AT: Final = 0.15
 
 
 @dataclass(frozen=True)
-class LiveDrive:
+class LiveDrive(PlayedDrive):
     """A drive with the settings for playing and mapping it.
 
     Attributes:
-        drive: to be played.
-        rate: times as fast as it was driven.
         state: of the SLAM that migrates: "full" or "pose".
-        out: folder for the maps of the SLAM's instances, absolute.
-        report: file for the player's report at its end, absolute.
-        working_directory: in which the drive is found.
     """
 
-    drive: Drive
-    rate: float
     state: str
-    out: Path
-    report: Path
-    working_directory: Path
-
-    @property
-    def period(self) -> float:
-        """Return the seconds between two scans, as played."""
-        return float(np.median(np.diff(self.drive.times))) / self.rate
 
 
 def usual_rate(drive: Drive) -> float:
@@ -122,21 +105,8 @@ def slam_spec(live: LiveDrive) -> ProcessSpec:
 
 
 def player_spec(live: LiveDrive) -> ProcessSpec:
-    """Return the player, which plays the drive once, when the SLAM has subscribed."""
-    return ProcessSpec(
-        name=PLAYER,
-        module="rosrm_examples.player",
-        arguments=(
-            "--drive", live.drive.name, "--rate", f"{live.rate:.6g}", "--report", str(live.report),
-        ),
-        environment={"OMP_NUM_THREADS": "1"},
-        working_directory=str(live.working_directory),
-        ros=True,
-        kind=Kind.JOB,
-        needs={"memory": _PLAYER_MB * 1e6},
-        required_labels=_SCANNER,
-        stop=NODE_STOP,
-    )  # fmt: skip
+    """Return the player, which starts when the SLAM has subscribed."""
+    return live.player(needs={"memory": _PLAYER_MB * 1e6}, required_labels=_SCANNER)
 
 
 def recorder_spec() -> ProcessSpec:

@@ -6,13 +6,11 @@ returns to the second one, also with the SLAM, which it had replaced already.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 from typing import Final
 
 from rosrm import (
     Client,
-    Kind,
     Listing,
     MigrationPolicy,
     ProcessSpec,
@@ -24,12 +22,12 @@ from rosrm.config.settings import ClusterConfig, HostConfig, MigrationSettings
 from rosrm_examples.demo_job import NODE_STOP
 from rosrm_examples.demo_progress import Progress
 from rosrm_examples.demo_record import ENDED
-from rosrm_examples.drives import Drive
 from rosrm_examples.observer import Observer
+from rosrm_examples.played_drive import PLAYER, PlayedDrive
 
 HOST: Final = "robot"
 APPLICATION: Final = "mapping"
-SLAM, VIEWER, RECORDER, PLAYER = "slam", "viewer", "recorder", "player"
+SLAM, VIEWER, RECORDER = "slam", "viewer", "recorder"
 #: Bytes of memory in the budget of the host, which must be free on this machine.
 BUDGET: Final = 768 * 2**20
 #: Seconds for which a new instance must run.
@@ -49,23 +47,6 @@ _MAP_EVERY: Final = {1: 10, 2: 5, 3: 4}
 _SCANS_BETWEEN: Final = 20
 
 
-@dataclass(frozen=True)
-class LiveRollout:
-    """A drive with the folders of its mapping.
-
-    Attributes:
-        drive: to be played as fast as it was driven.
-        out: folder for the maps of the SLAM's instances, absolute.
-        report: file for the player's report at its end, absolute.
-        working_directory: in which the drive is found.
-    """
-
-    drive: Drive
-    out: Path
-    report: Path
-    working_directory: Path
-
-
 def cluster_config() -> ClusterConfig:
     """Return the master's settings: no migration but those of the rollout."""
     return ClusterConfig(
@@ -83,13 +64,13 @@ def host_config(cores: int) -> HostConfig:
     )
 
 
-def target(live: LiveRollout, version: int) -> Target:
+def target(live: PlayedDrive, version: int) -> Target:
     """Return a version of the application, from 1 to 3."""
     specs = (_slam(live, version), _viewer(version), _recorder(version))
     return Target(APPLICATION, specs, rollout=RolloutPolicy(healthy_for=HEALTHY_FOR))
 
 
-def _slam(live: LiveRollout, version: int) -> ProcessSpec:
+def _slam(live: PlayedDrive, version: int) -> ProcessSpec:
     """Return the process that hands over its state."""
     return ProcessSpec(
         name=SLAM,
@@ -127,24 +108,10 @@ def _recorder(version: int) -> ProcessSpec:
     )
 
 
-def player_spec(live: LiveRollout) -> ProcessSpec:
-    """Return the player, which plays the drive once and belongs to no application."""
-    return ProcessSpec(
-        name=PLAYER,
-        module="rosrm_examples.player",
-        arguments=("--drive", live.drive.name, "--report", str(live.report)),
-        environment={"OMP_NUM_THREADS": "1"},
-        working_directory=str(live.working_directory),
-        ros=True,
-        kind=Kind.JOB,
-        stop=NODE_STOP,
-    )
-
-
 class RolloutScript:
     """A script that applies version after version, and ends when all scans are mapped."""
 
-    def __init__(self, live: LiveRollout, observer: Observer) -> None:
+    def __init__(self, live: PlayedDrive, observer: Observer) -> None:
         self._live = live
         self._observer = observer
         self._applied = 0  # newest version that was requested
@@ -163,7 +130,7 @@ class RolloutScript:
         elif self._reached and not self._played and self._observer.publishers():
             self._played = True
             self._progress.note_action()
-            client.submit(player_spec(self._live))
+            client.submit(self._live.player())
 
     def _is_due(self) -> bool:
         """Return True if the next version is to be applied."""

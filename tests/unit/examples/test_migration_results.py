@@ -109,7 +109,7 @@ def test_nothing_was_heard() -> None:
 
 def test_only_the_slam_moves_and_only_off_the_fast_disk(tmp_path) -> None:
     """Only the SLAM may move, and it fits on either big host."""
-    live = LiveDrive(DRIVE, 1.0, "full", tmp_path, tmp_path / "report", tmp_path)
+    live = LiveDrive(DRIVE, 1.0, tmp_path, tmp_path / "report", tmp_path, "full")
     slam, recorder = slam_spec(live), recorder_spec()
     assert slam.migration.strategy == "handoff"
     assert recorder.migration.strategy is None

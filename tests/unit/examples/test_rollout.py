@@ -13,7 +13,8 @@ from rosrm.model.rows import EventRow, Listing, ProcessRow
 from rosrm_examples import rollout_plot
 from rosrm_examples.demo_record import Record, Sample
 from rosrm_examples.drives import load_drive
-from rosrm_examples.rollout_job import LiveRollout, RolloutScript, target
+from rosrm_examples.played_drive import PlayedDrive
+from rosrm_examples.rollout_job import RolloutScript, target
 from rosrm_examples.rollout_record import Request, rollout_of
 
 EVENTS = (
@@ -134,7 +135,7 @@ def view(*applied: int, player: str = "running") -> Listing:
 
 def test_each_version_is_applied_once_the_one_before_runs_and_scans_are_mapped():
     drive = load_drive("street:60")
-    live = LiveRollout(drive, Path("/out"), Path("/report"), Path("/"))
+    live = PlayedDrive(drive, 1.0, Path("/out"), Path("/report"), Path("/"))
     observer = SimpleNamespace(received=[], publishers=lambda: 1)
     client, script = FakeClient(), RolloutScript(live, observer)
 
@@ -164,7 +165,7 @@ def test_each_version_is_applied_once_the_one_before_runs_and_scans_are_mapped()
 
 
 def test_all_processes_of_a_version_belong_to_the_application():
-    live = LiveRollout(load_drive("street:60"), Path("/out"), Path("/report"), Path("/"))
+    live = PlayedDrive(load_drive("street:60"), 1.0, Path("/out"), Path("/report"), Path("/"))
     for version in (1, 2, 3):
         specs = target(live, version).specs
         assert {spec.application for spec in specs} == {"mapping"}
