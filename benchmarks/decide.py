@@ -6,11 +6,14 @@ master's runtime, without the transport and the journal:
 - `us_per_host`: one process is submitted right after fresh readings of all hosts, so that every
   host is evaluated again: microseconds from SubmissionReceived to the commands, per host. The
   paper's master took 84 us per slave for its whole cycle. `readings_us_per_host`: the cost of these
-  readings.
+  readings. `over_floor`: the time of the decision over that of a floor (`floor_us`), by turns in
+  one run: one numpy pass over the same arrays, with the needs as shares of each capacity, the test
+  of the limits, the weighted sum and one argmin; nothing is checked, recorded or accounted.
 - `assignments_per_s`: many processes are submitted at once; from SubmissionReceived to the
   commands, with the queue, the record and the intent of each. `assignments_per_s` is for equal
   processes, `mixed_assignments_per_s` for ten different demands by turns (such as the pieces of a
-  map), where each assignment makes the scores of the other demands stale.
+  map), where each assignment makes the scores of the other demands stale. `rate_of_floor`:
+  `assignments_per_s` as a share of what the floor alone would allow.
 - `constrained`: 1,000 processes submitted at once to 1,000 hosts. `plain`: ten different demands by
   turns; `applications`: the same demands with labels and neighbours, in applications of ten
   processes that belong together; `spread`: the same demands, in groups of 150 processes that keep
@@ -28,6 +31,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from statistics import median
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,11 +53,13 @@ from rosrm.model.values import (
     ResourceDescription,
 )
 from rosrm_scoring.network import Network, NetworkOptions
-from rosrm_scoring.weighted import Weighted, WeightedOptions
+from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Weighted, WeightedOptions
 
 _HOSTS = (10, 100, 1_000, 10_000)
 _RESOURCES = ("memory", "cpu", "disk")
 _LIMIT = 0.8
+#: Seconds since the hosts registered; in the first one, placement may wait for their requests.
+_LONG_AGO = 10.0
 _AT_ONCE = 5_000
 _CONSTRAINED = 1_000
 _RACKS = 50
@@ -102,6 +108,7 @@ class Bench:
         self.read()
         for number in range(hosts):
             self.step(happened.ProcessRequested(number, number + 1, number + 1))
+        self.now += _LONG_AGO
 
     def step(self, event: happened.Event) -> tuple[float, int]:
         """Process an event; return the seconds that it took, and the number of assignments."""
@@ -128,22 +135,43 @@ class Bench:
         took, _ = self.step(readings)
         return took
 
+    def floor(self) -> float:
+        """Return the seconds of the least that a decision for `equal` computes of all hosts."""
+        table, needs = self.state.hosts, equal(0).needs
+        amounts = np.array([[needs.get(name, 0.0)] for name in table.resources])
+        weights = np.array([DEFAULT_WEIGHTS[name] for name in table.resources])
+        began = time.perf_counter()
+        fits = np.logical_and.reduce(table.busy + amounts / table.capacity <= table.limit)
+        np.where(fits, weights @ table.busy, np.inf).argmin()
+        return time.perf_counter() - began
+
     def submit(self, specs: Sequence[ProcessSpec]) -> tuple[float, int]:
         """Submit processes at once; return as `step`."""
         return self.step(happened.SubmissionReceived(1, tuple(specs)))
 
 
-def decision(hosts: int, runs: int) -> tuple[float, float]:
-    """Return the median microseconds by host of one decision, and of the readings before it."""
+class Timed(NamedTuple):
+    """Median microseconds of a decision, its readings and the floor; median ratio of the two."""
+
+    decision: float
+    readings: float
+    floor: float
+    over_floor: float
+
+
+def decision(hosts: int, runs: int) -> Timed:
+    """Time single decisions after fresh readings, by turns with the floor."""
     bench = Bench(hosts)
-    decisions, readings = [], []
+    decisions, readings, floors = [], [], []
     for number in range(runs):
         readings.append(bench.read())
-        took, assigned = bench.submit([equal(number)])
+        floors.append(bench.floor())
+        seconds, assigned = bench.submit([equal(number)])
         assert assigned == 1
-        decisions.append(took)
-    per_host = 1e6 / hosts
-    return median(decisions) * per_host, median(readings) * per_host
+        decisions.append(seconds)
+    ratios = [both[0] / both[1] for both in zip(decisions, floors, strict=True)]
+    took, read, floor = (1e6 * median(one) for one in (decisions, readings, floors))
+    return Timed(took, read, floor, median(ratios))
 
 
 def rate(hosts: int, runs: int, spec_of: SpecOf, count: int = _AT_ONCE) -> float:
@@ -235,19 +263,26 @@ def main() -> None:
     command_line.add_argument("--runs", type=int, default=7, help="measurements of each figure")
     runs = command_line.parse_args().runs
     per_host, read, rates, mixed_rates = {}, {}, {}, {}
+    floor_us, over_floor, rate_of_floor = {}, {}, {}
     for hosts in _HOSTS:
-        us, readings = decision(hosts, 20 * runs)
-        per_host[str(hosts)], read[str(hosts)] = round(us, 4), round(readings, 4)
-        say(f"{hosts:6} hosts: {us:.4f} us a host for a decision, {readings:.4f} for its readings")
+        us, readings, floor, over = decision(hosts, 20 * runs)
+        per_host[str(hosts)], read[str(hosts)] = round(us / hosts, 4), round(readings / hosts, 4)
+        floor_us[str(hosts)], over_floor[str(hosts)] = round(floor, 1), round(over, 2)
+        say(
+            f"{hosts:6} hosts: {us / hosts:.4f} us a host for a decision, {over:.2f} times the "
+            f"floor of {floor:.1f} us; {readings / hosts:.4f} us for its readings"
+        )
     for hosts in _HOSTS:
         rates[str(hosts)] = round(rate(hosts, runs, equal))
         mixed_rates[str(hosts)] = round(rate(hosts, runs, mixed))
+        rate_of_floor[str(hosts)] = round(rates[str(hosts)] * floor_us[str(hosts)] / 1e6, 2)
         say(f"{hosts:6} hosts: {rates[str(hosts)]} equal, {mixed_rates[str(hosts)]} mixed a second")
     with_rules = constrained(runs)
     for name, figure in with_rules.items():
         say(f"{name:12}: {figure['assignments_per_s']} a second, {figure['times']} times as long")
     figures = {
-        "us_per_host": per_host, "assignments_per_s": rates,
+        "us_per_host": per_host, "floor_us": floor_us, "over_floor": over_floor,
+        "assignments_per_s": rates, "rate_of_floor": rate_of_floor,
         "mixed_assignments_per_s": mixed_rates, "readings_us_per_host": read,
         "constrained": with_rules,
     }  # fmt: skip

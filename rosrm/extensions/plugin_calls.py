@@ -139,6 +139,8 @@ class PluginCalls:
 
     def changes(self, now: float) -> list[tuple[Plugin, str]]:
         """Return the plugins that began to fail, or to work (""), since the last call."""
+        if not self._failed and not self.failing:
+            return []
         found: list[tuple[Plugin, str]] = []
         for plugin, noted in self._failed.items():
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):

@@ -5,7 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final, get_args
 
-from rosrm.model.values import MOST_USED, Enforcement, ProcessSpec, RealtimePolicy
+from rosrm.model.values import (
+    MOST_USED,
+    Enforcement,
+    Limits,
+    ProcessSpec,
+    Realtime,
+    RealtimePolicy,
+)
 from rosrm.wording import amount
 
 #: Bytes that each process needs for its start, even one without an interpreter.
@@ -13,12 +20,17 @@ LEAST_MEMORY: Final = 4e6
 #: Cores: the kernel allows no less than 1 ms in 100 ms.
 LEAST_CPU: Final = 0.01
 LARGEST_CPU_NUMBER: Final = 65_535
+_NO_LIMITS: Final = Limits()
+_NO_REALTIME: Final = Realtime()
 #: Unit of each limit.
 _UNITS: Final = {"memory": "B", "memory_high": "B", "cpu": "core"}
 
 
 def limits_fault(spec: ProcessSpec) -> str:
     """Return the first fault of limits, cpus, realtime and nice, with its key; "": none."""
+    plain = not (spec.cpus or spec.nice)
+    if plain and spec.limits == _NO_LIMITS and spec.realtime == _NO_REALTIME:
+        return ""
     return next(_faults(spec), "")
 
 

@@ -89,7 +89,8 @@ class WeightedSum:
             if name not in hosts.resources:
                 continue
             term = hosts.column(name, self._missing)
-            term *= weight
+            if weight != 1.0:
+                term *= weight
             total = term if total is None else np.add(total, term, out=total)
         return np.zeros(len(hosts.usage)) if total is None else total
 

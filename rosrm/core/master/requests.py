@@ -140,8 +140,8 @@ def _owned_from(state: MasterState, name: str, by: Requester) -> int:
 
 def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
     """Return why the submitted names cannot be used; "" if they can."""
-    twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
-    if twice:
+    if len({spec.name for spec in event.specs}) < len(event.specs):
+        twice = [name for name, n in Counter(spec.name for spec in event.specs).items() if n > 1]
         return f"submitted twice at once: {listed(twice)}; names are unique"
     taken = [
         spec.name for spec in event.specs

@@ -223,6 +223,40 @@ def test_a_refreshed_ranking_equals_a_new_one(
         assert ranking.value.tolist() == ranked(table, demand).value.tolist()
 
 
+@given(tables(most=3), demands(), st.data())
+def test_a_ranking_after_new_readings_equals_a_new_one(
+    table: HostTable, demand: Demand, data: st.DataObject
+) -> None:
+    """Needs and filters that readings do not change are kept; all others are computed again."""
+    ranking = ranked(table, demand)
+    for host in table.hosts:
+        column = host.column
+        table.usage[:, column] *= data.draw(fractions)
+        table.limit[:, column] *= data.draw(st.sampled_from([0.5, 1.0]))
+        table.stale[column], table.accepting[column] = data.draw(rarely), data.draw(usually)
+        table.add_reservation(host, np.full(len(table.resources), data.draw(fractions)))
+    np.add(table.usage, table.load, out=table.busy)
+    table.readings_changed()
+    ranking.refresh()
+    new = ranked(table, demand)
+    assert ranking.outlasts_readings()
+    assert (ranking.value.tolist(), ranking.need.tolist()) == (
+        new.value.tolist(),
+        new.need.tolist(),
+    )
+    assert decide(ranking).verdicts == decide(new).verdicts
+
+
+def test_only_readings_leave_a_ranking_in_use() -> None:
+    """A change of a host's labels or condition makes the filters that a ranking keeps void."""
+    table = HostTable()
+    host = table.register(HostDescription("a", 1), 0.0)
+    ranking = ranked(table, Demand(ProcessSpec("p"), {}))
+    table.set_condition(host, HostCondition.SUSPECT)
+    table.readings_changed()
+    assert not ranking.outlasts_readings()
+
+
 @given(tables(), st.lists(device_needs, min_size=1, max_size=3), st.data())
 def test_counts_of_devices_follow_every_change(
     table: HostTable, needs: list[tuple[DeviceNeed, ...]], data: st.DataObject

@@ -9,6 +9,7 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
+from rosrm.core.master.modes.settings import apply_settings
 from rosrm.core.master.modes.switching import mode_rows
 from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.applications import RolloutPolicy, Target
@@ -357,6 +358,22 @@ def test_the_weights_of_a_mode_apply_while_it_is_in_force() -> None:
     assert made[-1] == {"eq1": {"weights": {"memory": 0.0, "cpu": 1.0}}}
     switch(cluster, "exploring")
     assert made[-1] == {"eq1": {"weights": {"memory": 1.0}}}
+
+
+def test_new_weights_apply_to_a_process_that_waits_already() -> None:
+    """No cached demand or ranking keeps the former policies."""
+    cluster = Cluster(Machine("a", busy={"memory": 0.6, "cpu": 0.1}))
+    cluster.state.chain_of = lambda settings: tuple(
+        ScoringLink("eq1", Eq1(**one.options["weights"])) for one in settings
+    )
+    cluster.set_host("a", "cordon")
+    cluster.submit(process("p"))
+    by_cpu = {"weights": {"memory": 0.0, "cpu": 1.0}}
+    cluster.state.scoring = (PolicySettings("eq1", 1.0, by_cpu),)
+    apply_settings(cluster.state)
+    cluster.set_host("a", "uncordon")
+    (verdict,) = cluster.explain("p")["decision"]["hosts"]
+    assert verdict["score"] == pytest.approx(0.1)
 
 
 # --- loading ----------------------------------------------------------------------------------

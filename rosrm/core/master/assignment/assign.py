@@ -208,7 +208,7 @@ def _first_request_awaited(state: MasterState, now: float) -> str:
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a time or snapshot, and do not block those behind them."""
     delayed = _delayed(state, now)
-    if not state.hosts.having(_AWAY).any():
+    if not state.hosts.condition.any() or not state.hosts.having(_AWAY).any():  # UP is 0
         return delayed
     names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
     for name in names:
@@ -271,8 +271,8 @@ def _versions(state: MasterState) -> tuple[int, ...]:
 
     While none of them grows, a process that did not fit still does not fit.
     """
-    hosts, others = state.hosts, (state.queue, state.gangs, state.learned)
-    return (hosts.version, len(hosts.touched), *(one.version for one in others))
+    hosts, queue, gangs_, learned = state.hosts, state.queue, state.gangs, state.learned
+    return hosts.version, len(hosts.touched), queue.version, gangs_.version, learned.version
 
 
 def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Final
+
 from rosrm.core.master.assignment.flows import traffic_of
 from rosrm.core.master.assignment.neighbours import neighbours_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.scheduling.ranking import Ranking
-from rosrm.core.master.state.demand import Demand
+from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.process import Process
+
+#: Number of rankings above which new readings remove all of them, as most are not needed again.
+_MOST_KEPT: Final = 64
 
 
 def demand_of(state: MasterState, process: Process) -> Demand:
@@ -40,7 +46,7 @@ def demand_of(state: MasterState, process: Process) -> Demand:
 def ranking_of(state: MasterState, demand: Demand) -> Ranking:
     """Return the current ranking of all hosts for a demand; only assignments update it in place."""
     if state.rankings_version != state.hosts.version:
-        state.rankings.clear()
+        state.rankings = _kept(state.rankings)
         state.demands.clear()
         state.rankings_version = state.hosts.version
     ranking = state.rankings.get(demand.key)
@@ -54,3 +60,10 @@ def ranking_of(state: MasterState, demand: Demand) -> Ranking:
         ranking = Ranking(state.hosts, demand)
         state.rankings[demand.key] = ranking
     return ranking
+
+
+def _kept(rankings: Mapping[RankingKey, Ranking]) -> dict[RankingKey, Ranking]:
+    """Return the rankings to which only readings and assignments have come since they were made."""
+    if len(rankings) > _MOST_KEPT:
+        return {}
+    return {key: ranking for key, ranking in rankings.items() if ranking.outlasts_readings()}

@@ -57,6 +57,8 @@ def check_gangs(state: MasterState, specs: Sequence[ProcessSpec], principal: str
 
 def members_of(state: MasterState, process: Process) -> list[Process]:
     """Return the processes together with which a process is placed, in order of submission."""
+    if not process.awaits_gang:
+        return [process]
     found = (state.processes[name] for name in state.gangs.of(process))
     return sorted(found, key=lambda one: (-one.spec.priority, one.order))
 

@@ -48,7 +48,7 @@ def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> B
     table.reported[at[fresh]] = readings.status_sequence[fresh]
     table.stale[at[fresh & ~sane]] = _SLOT_BITS.sum()
     _store(table, readings, at, fresh & sane)
-    table.changed()
+    table.readings_changed()
     far_ahead = late & (readings.sequence > table.sequence[at])
     return np.asarray(~(known & sane) | far_ahead)
 

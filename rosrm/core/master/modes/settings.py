@@ -24,6 +24,9 @@ def apply_settings(state: MasterState) -> None:
             state.modes.fault[mode.name] = f"its weights do not apply: {fault}"
         return
     state.placement, state.scoring_in_force = replace(state.placement, chain=chain), scoring
+    for process in state.processes.values():
+        process.demand = None  # it has the former policies
+    state.hosts.changed()
 
 
 def weighted(state: MasterState, mode: Mode) -> tuple[PolicySettings, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,7 +51,7 @@ class Candidates:
     busy: FloatArray
     processes: IntArray
     bound: IntArray
-    inventories: list[Inventory]
+    inventories: Sequence[Inventory]
     sets: IntArray | None = None
     more: IntArray | None = None
     known_flows: FlowView | None = None

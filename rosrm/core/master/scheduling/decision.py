@@ -171,15 +171,14 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     """
     column = ranking.best() if chosen is None else chosen
     listed = ranking.table.listed()
-    first = [host.column for host in listed[:_NAMED_HOSTS]]
     if len(listed) <= _NAMED_HOSTS:
-        moment = _moment(ranking, _first(column, first))
+        moment = _moment(ranking, _first(column, [host.column for host in listed]))
         return Decision(column, ranking.policy_name, moment, EMPTY)
     # With many hosts, only the runners-up are named, because this path must be quick.
-    nearly = ranking.lowest() if column >= 0 else first
-    moment = _moment(ranking, _first(column, nearly))
+    first = [host.column for host in listed[:_NAMED_HOSTS]] if column < 0 else ranking.lowest()
+    moment = _moment(ranking, _first(column, first))
     named, fitting = len(moment.value), int(np.count_nonzero(ranking.value < np.inf))
-    named_fitting = sum(value < np.inf for value in moment.value.tolist())
+    named_fitting = named - moment.value.tolist().count(np.inf)
     omitted = {
         "would take it at a higher score": fitting - named_fitting,
         "cannot take it now": len(listed) - fitting - (named - named_fitting),

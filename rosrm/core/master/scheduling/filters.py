@@ -53,6 +53,7 @@ class Filter:
         by_assignment: True if an assignment changes the mask. Mask and reason then may read only
             the demand and the arrays of the candidates, because a decision copies those alone and
             formats the reason later.
+        by_reading: True if a reading changes the mask.
         verdict: stands before the reason in an explanation.
     """
 
@@ -61,6 +62,7 @@ class Filter:
     reason: Callable[[Candidates, int], str]
     lasts: Lasts = Lasts.MOMENT
     by_assignment: bool = False
+    by_reading: bool = False
     verdict: Literal["excluded", "full"] = "excluded"
 
 
@@ -313,8 +315,9 @@ def _why_no_devices(hosts: Candidates, row: int) -> str:
 
 def _has_room(hosts: Candidates) -> BoolArray:
     # A host without a resource has NaN there, which exceeds no limit.
-    limits = hosts.cells[LIMIT] - (hosts.demand.headroom - _CLOSE)
-    has_room: BoolArray = ~np.logical_or.reduce(hosts.busy + hosts.need > limits)
+    over = hosts.busy + hosts.need
+    over -= hosts.cells[LIMIT]
+    has_room: BoolArray = ~np.logical_or.reduce(over > _CLOSE - hosts.demand.headroom)
     return has_room
 
 
@@ -358,8 +361,8 @@ FILTERS: Final = (
     Filter("cordon", _is_open, _why_not_open, Lasts.AWAY),
     Filter("suspect", _is_not_suspect, _why_not_up),
     Filter("processes", _has_slot, _why_no_slot, by_assignment=True),
-    Filter("stale", _is_fresh, _why_stale),
-    Filter("limits", _is_accepting, _why_not_accepting),
+    Filter("stale", _is_fresh, _why_stale, by_reading=True),
+    Filter("limits", _is_accepting, _why_not_accepting, by_reading=True),
     Filter("report", _has_reported, _why_not_reported),
     Filter("request", _has_asked, _why_not_asked),
     Filter(
@@ -377,4 +380,7 @@ FILTERS: Final = (
 #: Filters that a host may fail for lack of room alone.
 OF_ROOM: Final = ("processes", "limits", "room")
 STANDING: Final = tuple(one for one in FILTERS if not one.by_assignment)
+#: Those of `STANDING` that neither an assignment nor a reading changes, and the others.
+STEADY: Final = tuple(one for one in STANDING if not one.by_reading)
+BY_READING: Final = tuple(one for one in STANDING if one.by_reading)
 BY_ASSIGNMENT: Final = tuple(one for one in FILTERS if one.by_assignment)

@@ -6,8 +6,9 @@ score of a chain of policies is the sum of their scores, each times its weight.
 A `Ranking` caches the scores for one demand. Equal processes share it, and after an assignment only
 the scores of the changed hosts are computed again.
 
-This module is the hot path of the master. A ranking is made once for each demand and batch of
-readings (one pass over all hosts); each assignment costs one refresh and one argmin.
+This module is the hot path of the master. New readings cost one pass over all hosts for each
+demand, without the filters and needs that readings do not change; each assignment costs one refresh
+and one argmin.
 """
 
 from __future__ import annotations
@@ -21,8 +22,10 @@ import numpy as np
 from rosrm.core.master.scheduling.candidates import Candidates, Columns, candidates
 from rosrm.core.master.scheduling.filters import (
     BY_ASSIGNMENT,
+    BY_READING,
     PLUGINS,
     STANDING,
+    STEADY,
     Refusal,
     passing,
     refusals,
@@ -66,25 +69,29 @@ class Ranking:
     def __init__(self, table: HostTable, demand: Demand) -> None:
         self.table = table
         self.demand = demand
-        self.judges = demand.plugins.chain
-        self.reads_tenants = False
-        self.failure = ""
-        self.version = table.version
         self.need = table.fractions(demand.amounts, demand.estimated)
-        self._fallback = demand.plugins.fallback
-        self._seen = len(table.touched)
-        every = slice(0, len(table))
-        self._standing = passing(STANDING, candidates(table, demand, self.need, every))
-        self._refusals: dict[int, Refusal | None] = {}
+        self._every = slice(0, len(table))
+        self._steady = passing(STEADY, self._candidates(self._every))
+        self._steady_version = table.version_without_readings
         self._tier = _tiers(table, demand)
         self._preference: FloatArray | None = None
         self._flows: FlowView | None = None
         self._alone: Ranking | None = None
+        self.value: FloatArray
+        self._judge_all()
+
+    def _judge_all(self) -> None:
+        """Judge every host with the current readings."""
+        table, plugins = self.table, self.demand.plugins
+        self.judges, self._fallback = plugins.chain, plugins.fallback
+        self.reads_tenants, self.failure = False, ""
+        self.version, self._seen, self._own = table.version, len(table.touched), -1
+        judged = self._candidates(self._every)
+        self._standing = passing(BY_READING, judged, self._steady)
+        self._refusals: dict[int, Refusal | None] = {}
         self._lowest: list[int] | None = None
-        self._own = -1
         self._ahead: dict[int, list[float]] = {}
-        self.value = np.full(len(table), np.inf)
-        self._judge(every)
+        self._judge(judged)
 
     @property
     def policy_name(self) -> str:
@@ -119,16 +126,16 @@ class Ranking:
 
     def _judge_flows(self, alone: Ranking) -> None:
         """Add the scores of the policies that read flows, and apply such filters."""
-        chain, every = self.demand.plugins.chain, slice(0, len(self.table))
+        chain = self.demand.plugins.chain
         readers = tuple(one for one in chain if FLOWS_FIELD in one.reads)
         self.judges = tuple(one for one in chain if one in alone.judges or one in readers)
         self._fallback = self.demand.plugins.fallback
-        judged = candidates(self.table, self.demand, self.need, every)
+        judged = self._candidates(self._every)
         self._flows = judged.flows()
         fits = passing([PLUGINS], judged, self.value < np.inf)
         value = self._scored(readers, judged, fits, np.where(fits, self.value, 0.0))
         if value is None:
-            self._judge(every)
+            self._judge(judged)
         else:
             self.value = value
 
@@ -138,8 +145,21 @@ class Ranking:
         if self._alone is not None:
             self._alone.note_assignment()
 
+    def outlasts_readings(self) -> bool:
+        """Return True if only readings and assignments have changed the hosts since it was made.
+
+        A ranking with neighbours or flows returns False, because few demands share it.
+        """
+        made = self._steady_version == self.table.version_without_readings
+        return made and self._alone is None
+
     def refresh(self) -> None:
-        """Update the columns that assignments have changed since the last refresh."""
+        """Update the columns that readings and assignments have changed since the last refresh."""
+        if self.version != self.table.version:
+            if self.demand.estimated:  # a part of the limits, which readings report
+                self.need = self.table.fractions(self.demand.amounts, self.demand.estimated)
+            self._judge_all()
+            return
         touched = self.table.touched
         if len(touched) == self._seen:
             return
@@ -151,7 +171,7 @@ class Ranking:
             return
         for column in columns & self._ahead.keys():
             del self._ahead[column]
-        self._judge(np.fromiter(columns, np.int64, len(columns)))
+        self._judge_at(np.fromiter(columns, np.int64, len(columns)))
 
     def best(self) -> int:
         """Return the column with the lowest value; -1: none fits."""
@@ -196,18 +216,24 @@ class Ranking:
             if not self._standing[column] and column not in self._refusals
         ]  # fmt: skip
         if new:
-            hosts = candidates(self.table, self.demand, self.need, np.array(new))
+            hosts = self._candidates(np.array(new))
             self._refusals.update(zip(new, refusals(STANDING, hosts), strict=True))
         return tuple(self._refusals.get(column) for column in columns)
 
-    def _judge(self, columns: Columns) -> None:
+    def _judge_at(self, columns: Columns) -> None:
         """Set `value` of some columns."""
+        self._judge(self._candidates(columns))
+
+    def _judge(self, judged: Candidates) -> None:
+        """Set `value` of some hosts."""
         self._lowest = None
-        value = self._value(columns)
+        value = self._value(judged)
         if value is None:
-            self._judge(slice(0, len(self.table)))  # scores of two policies are not comparable
+            self._judge_at(self._every)  # scores of two policies are not comparable
+        elif judged.columns is self._every:
+            self.value = value
         else:
-            self.value[columns] = value
+            self.value[judged.columns] = value
 
     def _judge_ahead(self, column: int) -> None:
         """Set `value` of a column that just took a process of this demand.
@@ -217,23 +243,25 @@ class Ranking:
         """
         values = self._ahead.get(column)
         if not values:
-            judged = self._value(np.full(_AT_A_TIME, column), np.arange(_AT_A_TIME))
-            if judged is None:
-                self._judge(slice(0, len(self.table)))
+            more = np.arange(_AT_A_TIME)
+            ahead = self._value(self._candidates(np.full(_AT_A_TIME, column), more))
+            if ahead is None:
+                self._judge_at(self._every)
                 return
             if self.reads_tenants:  # which shows none of the processes that are added
-                self._judge(np.array([column]))
+                self._judge_at(np.array([column]))
                 return
-            values = self._ahead[column] = judged[::-1].tolist()
+            values = self._ahead[column] = ahead[::-1].tolist()
         self._lowest = None
         self.value[column] = values.pop()
 
-    def _value(self, columns: Columns, more: IntArray | None = None) -> FloatArray | None:
-        """Return the values of some hosts; None: the policy was left out, so all values are void.
+    def _candidates(self, columns: Columns, more: IntArray | None = None) -> Candidates:
+        """Return some hosts with the demand; `more` as in `candidates`."""
+        return candidates(self.table, self.demand, self.need, columns, more)
 
-        `more`, (n,), adds this number of further processes of this demand to each host.
-        """
-        judged = candidates(self.table, self.demand, self.need, columns, more)
+    def _value(self, judged: Candidates) -> FloatArray | None:
+        """Return the values of hosts; None: the policy was left out, so all values are void."""
+        columns = judged.columns
         judged.known_flows = self.flows(columns)
         fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
         value: FloatArray = np.multiply(judged.processes, TIE, dtype=np.float64)
@@ -255,7 +283,8 @@ class Ranking:
             if veto is not None:
                 fits = fits & ~veto
         self.reads_tenants = self.reads_tenants or judged.tenants_read
-        return np.where(fits, value, np.inf)
+        np.copyto(value, np.inf, where=~fits)
+        return value
 
     def flows(self, columns: Columns) -> FlowView | None:
         """Return the flows of the process on some hosts; None: no plugin has read them."""

@@ -6,7 +6,7 @@ on which it was made, and formats its reasons when they are read.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -229,10 +229,10 @@ class DeviceTable:
             found[column] = alike[inventory.devices]
         return found
 
-    def at(self, columns: slice | IntArray) -> list[Inventory]:
-        """Return the inventories of some hosts."""
+    def at(self, columns: slice | IntArray) -> Sequence[Inventory]:
+        """Return the inventories of some hosts; a slice has all hosts, with their later changes."""
         if isinstance(columns, slice):
-            return self._inventories[columns]
+            return self._inventories  # no copy, because it costs more than a filter
         return [self._inventories[column] for column in columns.tolist()]
 
     def kinds(self) -> list[str]:

@@ -138,6 +138,8 @@ class HostTable(HostColumns):
 
     Attributes:
         version: counter of changes that concern many hosts.
+        version_without_readings: the same, without the changes by readings.
+        newest_registration: time of the newest registration; -inf: none.
         links: measured links between hosts, and the flows across them.
         claims: column of a host on which room is made for a process -> priority of the process.
         touched: columns that assignments and ends have changed since `version` grew.
@@ -149,7 +151,8 @@ class HostTable(HostColumns):
         self.by_name: dict[str, Host] = {}
         self.hosts: list[Host] = []
         self.links = LinkTable()
-        self.version = 0
+        self.version = self.version_without_readings = 0
+        self.newest_registration = -np.inf
         self.touched: list[int] = []
         self.devices = DeviceTable()
         self.claims: dict[int, int] = {}
@@ -196,7 +199,7 @@ class HostTable(HostColumns):
         self.condition[column] = HostCondition.UP
         self.asking[column] = self.accepting[column] = self.report_due[column] = False
         self.stale[column] = 0
-        self.last_contact[column] = self.registered[column] = now
+        self.last_contact[column] = self.registered[column] = self.newest_registration = now
         self.bound[column] = description.max_processes or NO_BOUND
         self.period[column] = description.period
         self.incarnation[column] = description.incarnation
@@ -289,6 +292,11 @@ class HostTable(HostColumns):
 
     def changed(self) -> None:
         """Note that many hosts have changed, which makes earlier rankings void."""
+        self.version_without_readings += 1
+        self.readings_changed()
+
+    def readings_changed(self) -> None:
+        """Note new readings, after which a ranking must judge all hosts again."""
         self.version += 1
         self.touched.clear()
 
@@ -418,6 +426,8 @@ class HostTable(HostColumns):
 
     def about_to_ask(self, since: float) -> IntArray:
         """Return the hosts that registered after a time and will ask for their first work."""
+        if self.newest_registration <= since:
+            return np.empty(0, np.int64)
         young = (self.registered > since) & (self.condition == HostCondition.UP) & ~self.closed
         if not young.any():
             return np.flatnonzero(young)
