@@ -44,6 +44,7 @@ from rosrm.model.parameters import pattern_fault
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
+from rosrm.ros.cdr import made
 from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
 
@@ -147,15 +148,12 @@ def _unchanged(value: Any) -> Any:
 
 def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
     """Return a dataclass as a message of a type with the same fields; `others` are converted."""
-    # Not by the constructor, which makes all nested messages with their defaults first.
-    made = message.__new__(message)
-    made._check_fields = False  # noqa: SLF001 - as the constructor does
-    for name, there, convert, _ in _known_fields(type(value)):
-        if there not in others:
-            setattr(made, there, convert(getattr(value, name)))
-    for there, converted in others.items():
-        setattr(made, there, converted)
-    return made
+    same = {
+        there: convert(getattr(value, name))
+        for name, there, convert, _ in _known_fields(type(value))
+        if there not in others
+    }
+    return made(message, **same, **others)
 
 
 def _from_msg(wanted: type[_Value], message: Any, /, **others: Any) -> _Value:

@@ -74,10 +74,11 @@ def sealed(
 
 def envelope_to_msg(envelope: Envelope) -> msg.Sealed:
     """Return the ROS message of an envelope, for services."""
-    return msg.Sealed(
+    return cdr.made(
+        msg.Sealed,
         format=envelope.format, principal=envelope.principal, generation=envelope.generation,
         run=array("B", envelope.run), receiver_run=array("B", envelope.receiver_run),
-        counter=envelope.counter, body=array("B", envelope.body),
+        counter=envelope.counter, body=bytes(envelope.body),
     )  # fmt: skip
 
 
@@ -144,7 +145,7 @@ class SealedRequest:
     def answer(self, response: Any) -> None:
         """Send the response."""
         envelope = sealed(self.peer, self._channel, response, self._request)
-        self._opened.answer(srv.Sealed.Response(message=envelope_to_msg(envelope)))
+        self._opened.answer(cdr.made(srv.Sealed.Response, message=envelope_to_msg(envelope)))
 
 
 class SealedEndpoints(Generic[SecurityT]):
@@ -386,7 +387,7 @@ class SealedClient:
         """Send a request; return the future of its answer."""
         envelope = sealed(self.peer, self._requests, request)
         message = envelope_to_msg(envelope)
-        future = self._client.call_async(srv.Sealed.Request(message=message))
+        future = self._client.call_async(cdr.made(srv.Sealed.Request, message=message))
         self._sent[future] = self.peer, _sealed_part(envelope)
         return future
 
@@ -416,7 +417,9 @@ class _Answer:
     def __init__(self, client: SealedClient, future: Any) -> None:
         self._client = client
         self._future = future
-        self._set_executor = future._set_executor  # noqa: SLF001 - the executor calls it
+
+    def _set_executor(self, executor: Any) -> None:
+        """Do nothing: with an executor, the future would call back in a later turn of it."""
 
     def set_result(self, response: srv.Sealed.Response) -> None:
         """Complete the request, if the answer is genuine."""

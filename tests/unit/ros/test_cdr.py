@@ -88,3 +88,10 @@ def test_a_message_that_ends_early_is_refused() -> None:
         cdr.read(msg.ProcessUsage, data[:4] + b"\xff" * 60)
     with pytest.raises(ValueError, match="little-endian"):
         cdr.read(srv.Submit.Request, b"\0\0" + data[2:])
+
+
+def test_a_made_message_has_its_fields() -> None:
+    """It is the message of the constructor."""
+    spec = msg.ProcessSpec(name="a")
+    fields = {name: getattr(spec, name) for name in spec.get_fields_and_field_types()}
+    assert cdr.made(msg.ProcessSpec, **fields) == spec
