@@ -152,7 +152,7 @@ class SqliteJournal:
             database.executemany(
                 "INSERT OR REPLACE INTO intent VALUES (?, ?, ?)",
                 [
-                    (table, key, json.dumps(value, default=_plain))
+                    (table, key, _to_json(value))
                     for (table, key), value in intents.items()
                     if value is not None
                 ],
@@ -215,7 +215,7 @@ def _row(stored: StoredRecord) -> Row:
     record = stored.record
     return (
         stored.sequence, stored.wall_time, stored.elapsed, str(record.kind), record.process,
-        record.host, record.message, json.dumps(record.facts, default=_plain),
+        record.host, record.message, _to_json(record.facts),
     )  # fmt: skip
 
 
@@ -236,3 +236,7 @@ def _plain(value: object) -> object:
     if callable(item):
         return item()
     raise TypeError(f"{type(value).__name__} is no JSON")
+
+
+#: Made once, because `json.dumps` with a `default` makes an encoder for each call.
+_to_json: Final = json.JSONEncoder(default=_plain).encode

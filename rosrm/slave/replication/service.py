@@ -178,8 +178,9 @@ class ReplicationService:
 
     def ended(self, instance: InstanceId) -> None:
         """Forget the key of an instance that has ended without a snapshot."""
-        drop = partial(self._store.keys.drop, instance.process, instance.number)
-        self._in_thread(drop, lambda _: None)
+        if self._store.keys.may_have(instance.process):  # most have none
+            drop = partial(self._store.keys.drop, instance.process, instance.number)
+            self._in_thread(drop, lambda _: None)
 
     def report_again(self) -> None:
         """Report all snapshots to a master that has just registered this host."""
