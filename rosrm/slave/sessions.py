@@ -114,8 +114,7 @@ class SessionTable:
         with contextlib.suppress(OSError):  # it has ended
             if self._session_of(leader) != leader:
                 self._adopted.add(leader)
-        if self._launchers.leads(leader) is not False:
-            self._led.add(leader)
+        self._led.add(leader)  # until the next `refresh` asks the launchers
         self._collect_pids()
 
     def remove(self, leader: int, cpu_time: float) -> None:

@@ -70,8 +70,9 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
         state.hold(instance, _waiting(assignment))
     launches = _start_waiting(state, now)
     held = [state.held[one.instance] for one in event.assignments if one.instance in state.waiting]
+    why = state.why_wait()
     for one in held:
-        one.status = replace(one.status, message=state.why_wait())
+        one.status = replace(one.status, message=why)
     reports = refusals + [one.status for one in held]
     return [*launches, commands.Report(tuple(reports))] if reports else launches
 
