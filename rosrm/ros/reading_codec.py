@@ -1,21 +1,18 @@
-"""Codec of `resource_info`: one numpy call decodes a thousand messages.
+"""Encoder of `resource_info`, and the layout of the message.
 
-The message has a fixed size, so its CDR form is a C struct behind a header of four bytes. The test
-of this module compares every field with rclpy's own serialisation.
+The message has a fixed size, so its CDR form is a C struct behind a header of four bytes. A test
+compares every field with rclpy's own serialisation. The master's decoder is a module of its own,
+because it imports the master's events, which would cost each slave memory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
-from rosrm.core.master.events import ReadingsReceived
 from rosrm.model.values import RESOURCE_SLOTS
-from rosrm.version import PROTOCOL_VERSION
 
 #: Encapsulation: little-endian plain CDR, no options.
 _HEADER: Final = b"\x00\x01\x00\x00"
@@ -36,44 +33,8 @@ HOST_ID: Final = slice(8, 12)
 
 ACCEPTING: Final = 1
 #: Bits 8 to 15 of the flags: cycles without news since the message before.
-_QUIET_SHIFT: Final = 8
+QUIET_SHIFT: Final = 8
 MOST_QUIET: Final = 255
-
-
-@dataclass(frozen=True, slots=True)
-class Runs:
-    """Accounts of each run of a slave in a batch, in parallel arrays (R,).
-
-    Attributes:
-        host_id, incarnation: identify the run.
-        first: sequence of the earliest cycle in its messages.
-        sequence, beat: of its newest message; the beat in ns.
-        cycles: of the slave, that its messages in this batch account for.
-    """
-
-    host_id: npt.NDArray[np.int64]
-    incarnation: npt.NDArray[np.uint64]
-    first: npt.NDArray[np.int64]
-    sequence: npt.NDArray[np.int64]
-    beat: npt.NDArray[np.uint64]
-    cycles: npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class Decoded:
-    """A batch of messages.
-
-    Attributes:
-        readings: the newest of each run of a host; None: the batch has none.
-        runs: parallel to the readings, row by row.
-        refusals: one line for each kind of refused message.
-        received: messages of this protocol version.
-    """
-
-    readings: ReadingsReceived | None = None
-    runs: Runs | None = None
-    refusals: tuple[str, ...] = ()
-    received: int = 0
 
 
 def flags(*, accepting: bool, quiet: int) -> int:
@@ -83,7 +44,7 @@ def flags(*, accepting: bool, quiet: int) -> int:
         accepting: the slave is under all its limits and accepts work.
         quiet: cycles without news since the message before, at most `MOST_QUIET`.
     """
-    return (ACCEPTING if accepting else 0) | quiet << _QUIET_SHIFT
+    return (ACCEPTING if accepting else 0) | quiet << QUIET_SHIFT
 
 
 def encode(row: npt.NDArray[np.void]) -> bytes:
@@ -92,70 +53,3 @@ def encode(row: npt.NDArray[np.void]) -> bytes:
     raw = bytearray(row.tobytes())
     raw[:4] = _HEADER  # numpy strips trailing zeros of a byte string
     return bytes(raw)
-
-
-def decode(messages: Sequence[bytes]) -> Decoded:
-    """Decode serialised messages, oldest first.
-
-    Messages of another size, byte order or protocol version are refused, never misread.
-    """
-    fit = [raw for raw in messages if len(raw) == LAYOUT.itemsize and raw[1] == 1]
-    refusals = []
-    if len(fit) < len(messages):
-        refusals.append("a resource_info of another size than ours: another version of rosrm?")
-    if not fit:
-        return Decoded(refusals=tuple(refusals))
-    rows = np.frombuffer(b"".join(fit), LAYOUT)
-    ours = rows["protocol_version"] == PROTOCOL_VERSION
-    if not ours.all():
-        refusals += [
-            f"a resource_info of protocol version {version}; this side speaks {PROTOCOL_VERSION}"
-            for version in np.unique(rows["protocol_version"][~ours])
-        ]
-        rows = rows[ours]
-        if not len(rows):
-            return Decoded(refusals=tuple(refusals))
-    order, begins = _by_run(rows)
-    newest = rows[order[np.append(begins[1:], len(rows)) - 1]]
-    return Decoded(_event(newest), _runs(rows[order], begins, newest), tuple(refusals), len(rows))
-
-
-def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Group rows by run, so that a former run's late messages do not hide the present run's.
-
-    Returns:
-        The order of the rows by run of a slave, oldest first in each, and the start of each run.
-    """
-    run = rows["host_id"].astype(np.uint64) << np.uint64(32)
-    run |= rows["incarnation"] & np.uint64(0xFFFFFFFF)
-    order = np.argsort(run, kind="stable")
-    another = np.diff(run[order]) != 0
-    return order, np.append(0, np.flatnonzero(another) + 1)
-
-
-def _runs(
-    rows: npt.NDArray[np.void], begins: npt.NDArray[np.intp], newest: npt.NDArray[np.void]
-) -> Runs:
-    sequence = rows["sequence"].astype(np.int64)
-    spans = (rows["flags"] >> _QUIET_SHIFT).astype(np.int64) + 1
-    return Runs(
-        host_id=newest["host_id"].astype(np.int64),
-        incarnation=newest["incarnation"].copy(),
-        first=sequence[begins] - spans[begins] + 1,
-        sequence=newest["sequence"].astype(np.int64),
-        beat=newest["beat"].copy(),
-        cycles=np.add.reduceat(spans, begins),
-    )
-
-
-def _event(rows: npt.NDArray[np.void]) -> ReadingsReceived:
-    return ReadingsReceived(
-        host_id=rows["host_id"].astype(np.int64),
-        incarnation=rows["incarnation"].astype(np.uint64),
-        sequence=rows["sequence"].astype(np.uint64),
-        status_sequence=rows["status_sequence"].astype(np.uint64),
-        accepting=(rows["flags"] & ACCEPTING).astype(np.bool_),
-        stale=rows["stale"].astype(np.uint32),
-        usage=rows["usage"].astype(np.float64),
-        limit=rows["limit"].astype(np.float64),
-    )

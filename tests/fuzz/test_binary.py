@@ -22,7 +22,8 @@ from rosrm.node.arrays import arrays_message, arrays_of
 from rosrm.recording.encoding import encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
 from rosrm.recording.reader import Header, read_record
-from rosrm.ros.reading_codec import LAYOUT, decode
+from rosrm.ros.master.reading_decoder import decode
+from rosrm.ros.reading_codec import LAYOUT
 from rosrm.ros.reading_codec import encode as encode_reading
 from rosrm.snapshots.format import Block, Damaged, checked, decoded, encoded_head
 from rosrm.snapshots.reader import newest, newest_content, newest_head

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from importlib import import_module
 
-from rosrm import Launcher, LauncherContext, LauncherOffer, hookimpl
+from rosrm import Launcher, LauncherContext, LauncherOffer, SkipPlugin, hookimpl
 
 
 @hookimpl
@@ -15,6 +16,8 @@ def register_launchers() -> Sequence[LauncherOffer]:
 
 
 def _podman(context: LauncherContext) -> Launcher:
-    """Load the launcher, in slaves only."""
+    """Load the launcher, in slaves with podman only, because it imports psutil."""
+    if shutil.which("podman") is None:
+        raise SkipPlugin("podman is not installed")
     launcher: Launcher = import_module("rosrm_container.podman").Podman(context)
     return launcher

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.state.hosts import MOST_AHEAD
-from rosrm.ros.reading_codec import Runs
+from rosrm.ros.master.reading_decoder import Runs
 
 #: Seconds of silence after which a host's reading is no longer expected.
 _GONE: Final = 10.0

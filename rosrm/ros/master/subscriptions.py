@@ -13,11 +13,11 @@ from rosrm.errors import Refused
 from rosrm.keys.security import Authority, Peer
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import version_refusal
+from rosrm.ros.master.reading_decoder import decode
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLinks
 from rosrm.ros.master.strangers import Strangers
 from rosrm.ros.polling import polled_subscription, waiting
-from rosrm.ros.reading_codec import decode
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.sealed_readings import may_be_of_former_run, open_reading
 from rosrm.wording import sanitized

@@ -7,7 +7,8 @@ import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.model.values import RESOURCE_SLOTS
-from rosrm.ros.reading_codec import ACCEPTING, LAYOUT, MOST_QUIET, decode, encode, flags
+from rosrm.ros.master.reading_decoder import decode
+from rosrm.ros.reading_codec import ACCEPTING, LAYOUT, MOST_QUIET, encode, flags
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
 

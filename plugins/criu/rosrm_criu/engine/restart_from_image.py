@@ -10,7 +10,6 @@ Standard library only. It runs as `python -I -S restart_from_image.py FOLDER DIR
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import sys
@@ -25,6 +24,8 @@ from rosrm.errors import CriuError, PortableError
 from rosrm_criu.engine import paths, slots
 
 if TYPE_CHECKING:
+    import argparse
+
     from rosrm_criu.engine.slots import Rejoin
 
 #: Signals that Python handles or ignores by default; ignored ones would stay ignored after execve.
@@ -63,6 +64,8 @@ def main() -> NoReturn:
 
 
 def _options(words: list[str]) -> argparse.Namespace:
+    import argparse  # noqa: PLC0415 - a slave, which imports this module too, has no use for it
+
     parser = argparse.ArgumentParser(
         description="Starts a process from its newest image, or without one."
     )

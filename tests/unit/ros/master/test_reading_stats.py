@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rosrm.ros.master.reading_decoder import Runs
 from rosrm.ros.master.reading_stats import ReadingStats
-from rosrm.ros.reading_codec import Runs
 
 RUN = 500
 

@@ -15,8 +15,8 @@ from rosrm.keys.security import MasterSecurity
 from rosrm.model.orders import ReportInstances, StartInstance
 from rosrm.model.values import Assignment, HostDescription, InstanceId, ProcessSpec
 from rosrm.ros.control import accepted
+from rosrm.ros.master.reading_decoder import Runs
 from rosrm.ros.master.slave_links import HostLinks, _order_answered
-from rosrm.ros.reading_codec import Runs
 from rosrm_msgs import srv
 
 HOST, RUN = 1, 500

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.model.values import RESOURCE_SLOTS
+from rosrm.ros.master.reading_decoder import decode
 from rosrm.ros.master.reading_stats import ReadingStats
-from rosrm.ros.reading_codec import decode
 from rosrm.ros.slave.reporter import RESOLUTION, Reporter
 
 RUN = 77
