@@ -31,6 +31,7 @@ from rosrm.node.entities import (
     wants_info,
 )
 from rosrm.node.handoff.buffer import InputBuffer, Sent
+from rosrm.node.handoff.reader_count import ReaderCount
 from rosrm.node.handoff.replay import InputReplay
 from rosrm.node.identity import NodeIdentity
 from rosrm.ros.polling import waiting
@@ -83,6 +84,7 @@ class NodeEntities:
         self._late_until = 0.0
         self.inputs: list[Input] = []
         self.outputs: list[Any] = []
+        self.readers = ReaderCount(node)
         self.timers: list[TimerOf] = []
         self.on_cycle: Callable[[], None] = lambda: None
         self.on_overflow: Callable[[str], None] = lambda _: None

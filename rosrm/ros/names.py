@@ -37,6 +37,16 @@ def client_node() -> str:
     return f"rosrm_client_{os.getpid()}"
 
 
+def slave_node(host: str) -> str:
+    """Return the node name of the slave of a host; its other nodes have longer names."""
+    return f"rosrm_slave_{token(host)}"
+
+
+def is_slave_node(name: str) -> bool:
+    """Return True for the name of a node of a slave."""
+    return name.startswith("rosrm_slave_")
+
+
 @dataclass(frozen=True, slots=True)
 class Names:
     """Names below a namespace."""

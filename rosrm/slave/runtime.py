@@ -41,7 +41,7 @@ from rosrm.model.values import (
     InstanceStatus,
     LifecycleGoal,
 )
-from rosrm.ros.names import token
+from rosrm.ros.names import slave_node
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.slave.artifacts import ArtifactEndpoint
@@ -217,9 +217,7 @@ class SlaveRuntime:
     def _join_ros(self, opened: contextlib.ExitStack) -> GraphWatch:
         """Create participant and endpoint; return the view of the ROS graph."""
         config = self._config
-        self._participant = Participant(
-            config.ros, f"rosrm_slave_{token(config.host)}", pace="steady"
-        )
+        self._participant = Participant(config.ros, slave_node(config.host), pace="steady")
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
         self._endpoint = SlaveEndpoint(

@@ -299,6 +299,15 @@ std::string Node::visible_service(const std::string & name)
   return visible == resolved ? name : visible;
 }
 
+std::size_t Node::slave_readers(const std::string & topic) const
+{
+  const auto readers = get_subscriptions_info_by_topic(topic);
+  return std::count_if(
+    readers.begin(), readers.end(), [](const auto & one) {
+      return one.node_name().rfind("rosrm_slave_", 0) == 0;
+    });
+}
+
 std::shared_ptr<std::atomic<bool>> Node::gate() const
 {
   return session_ ? session_->entities.gate : nullptr;

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from typing import Final
+
 import pytest
 from std_msgs.msg import Int64, String
 
@@ -16,6 +20,7 @@ from tests.ros.nodes import (
     RELIABLE,
     Conductor,
     Counter,
+    Stage,
     pair_of,
 )
 
@@ -54,6 +59,46 @@ def test_the_next_handoff_may_begin_before_its_source_has_settled(stage, pair, m
     goes_on(stage, pair.counts)
     settle.pop()()
     conductor.wait(3, R.READY)
+
+
+#: A slave that reads the topic of a node, for its health check.
+_READS: Final = """
+import sys, time
+from std_msgs.msg import Int64
+from rosrm.model.ros_settings import RosSettings
+from rosrm.ros.participant import Participant
+slave = Participant(RosSettings(domain=int(sys.argv[1])), "rosrm_slave_h", pace="steady")
+health = slave.unwatched_node("rosrm_slave_h_health")
+reader = health.create_subscription(Int64, "/count", print, 10)
+time.sleep(300.0)
+"""
+
+
+@pytest.mark.timeout(120)
+def test_a_shadow_does_not_wait_for_the_reader_of_a_killed_slave(stage):
+    """The slave stays in the source's graph for 120 s, and the shadow never discovers it."""
+    counts = stage.listen(Int64, "count")
+    source = stage.instance(Counter, 1)
+    slave = subprocess.Popen([sys.executable, "-c", _READS, str(stage.domain)])
+    try:
+        stage.spin_until(
+            lambda: source.output.get_subscription_count() == 2, "the reader of the slave"
+        )
+        graph = stage.plain.get_subscriptions_info_by_topic
+        stage.spin_until(
+            lambda: "rosrm_slave_h_health" in [one.node_name for one in graph("/count")],
+            "the name of the slave",
+        )
+    finally:
+        slave.kill()
+        slave.wait()
+    later = Stage(beside=stage)  # its participant has never discovered the slave
+    later.instance(Counter, 2, alias="counter_1700000000", shadow=True)
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.hand_over()
+    goes_on(stage, counts)
+    assert source.output.get_subscription_count() == 2  # the reader of the slave is still there
+    assert is_gapless(counts)
 
 
 def test_a_shadow_waits_until_its_buffer_overlaps_the_state(stage, pair, monkeypatch):

@@ -299,14 +299,15 @@ class Destination:
 
     def _missing_peers(self, mark: StateMark) -> str:
         """Return the topic and number of peers matched with the source but not with this node."""
-        readers = {one.topic_name: one.get_subscription_count() for one in self._entities.outputs}
+        entities = self._entities
+        readers = {one.topic_name: entities.readers.of(one) for one in entities.outputs}
         for output in mark.outputs:
             if readers.get(output.topic, output.subscriptions) < output.subscriptions:
                 return (
                     f"for the readers of {output.topic}: {readers[output.topic]} of "
                     f"{output.subscriptions} matched"
                 )
-        writers = {one.key: one.subscription.get_publisher_count() for one in self._entities.inputs}
+        writers = {one.key: one.subscription.get_publisher_count() for one in entities.inputs}
         for covered in mark.inputs:
             if writers.get(covered.topic, covered.publishers) < covered.publishers:
                 return (

@@ -106,9 +106,7 @@ class HandoffSource:
             parts=[part.described() for part in self._parts],
             inputs=entities.covered_inputs(lambda one: one.subscription.get_publisher_count()),
             outputs=[
-                MatchedOutput(
-                    topic=one.topic_name, subscriptions=one.get_subscription_count()
-                )
+                MatchedOutput(topic=one.topic_name, subscriptions=entities.readers.of(one))
                 for one in entities.outputs
             ],
             timers_due=array("q", due),

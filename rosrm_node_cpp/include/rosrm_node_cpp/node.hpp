@@ -34,6 +34,7 @@
 #include "rclcpp/serialized_message.hpp"
 
 #include "rosrm_node_cpp/core/handoff_session.hpp"
+#include "rosrm_node_cpp/core/reader_count.hpp"
 
 namespace rosrm_node
 {
@@ -165,6 +166,7 @@ private:
   std::string visible_topic(const std::string & name);
   std::string resolved_topic(const std::string & name);
   std::string visible_service(const std::string & name);
+  std::size_t slave_readers(const std::string & topic) const;
   std::shared_ptr<std::atomic<bool>> gate() const;
   Timer::SharedPtr add_timer(
     std::chrono::nanoseconds period, std::function<void()> callback, bool is_wall);
@@ -241,8 +243,9 @@ typename Publisher<MessageT>::SharedPtr Node::create_publisher(
   if (session_) {
     auto output = std::make_shared<Output>();
     output->topic = plain->get_topic_name();
-    output->subscriptions = [plain] {
-        return static_cast<std::uint32_t>(plain->get_subscription_count());
+    output->subscriptions = [this, plain, readers = ReaderCount()]() mutable {
+        return readers.of(
+          plain->get_subscription_count(), [&] {return slave_readers(plain->get_topic_name());});
       };
     output->acknowledged = [plain] {
         return plain->wait_for_all_acked(std::chrono::nanoseconds(0));

@@ -234,6 +234,12 @@ constexpr bool stub_is_deferring_server = std::is_invocable_r_v<
   void, CallbackT, std::shared_ptr<rmw_request_id_t>,
   std::shared_ptr<typename ServiceT::Request>>;
 
+class TopicEndpointInfo
+{
+public:
+  const std::string & node_name() const;
+};
+
 class Node
 {
 public:
@@ -244,6 +250,8 @@ public:
 
   const char * get_fully_qualified_name() const;
   Logger get_logger() const;
+  std::vector<TopicEndpointInfo> get_subscriptions_info_by_topic(
+    const std::string & topic_name, bool no_mangle = false) const;
   Clock::SharedPtr get_clock();
 
   template<typename MessageT>
