@@ -18,20 +18,25 @@ class DiagnosticsFeed:
     """Decides which statuses are published, and when.
 
     An event names the host and the process that may have changed, so a change costs no search. A
-    change without an event, such as a usage near a limit, is published within a second.
+    change without an event, such as a usage near a limit, is published within a second. Nothing is
+    computed while the topic has no reader; a new reader gets all statuses within a second.
 
     Args:
         state: state of the master's core; read-only here.
         master: name of the master.
         publish: sends statuses.
+        has_reader: returns True if another node reads them.
     """
 
     def __init__(
-        self, state: MasterState, master: str, publish: Callable[[Sequence[Diagnostic]], None]
-    ) -> None:
+        self, state: MasterState, master: str, publish: Callable[[Sequence[Diagnostic]], None],
+        has_reader: Callable[[], bool],
+    ) -> None:  # fmt: skip
         self._state = state
         self._master = master
         self._publish = publish
+        self._has_reader = has_reader
+        self._is_read = False
         self._levels: dict[Subject, Level] = {}
         self._noted: dict[Subject, None] = {}
         self._next = 0.0
@@ -54,8 +59,10 @@ class DiagnosticsFeed:
         """
         if now >= self._next:
             self._next = now + _PERIOD
-            self._publish_all(core_now, trouble)
-        elif self._noted:
+            self._is_read = self._has_reader()
+            if self._is_read:
+                self._publish_all(core_now, trouble)
+        elif self._noted and self._is_read:
             self._publish_changes(core_now)
         self._noted.clear()
 

@@ -256,8 +256,8 @@ class MasterRuntime:
         return MasterEndpoint(self._endpoints, identity, reading, control)
 
     def _new_diagnostics(self) -> DiagnosticsFeed | None:
-        publish = open_diagnostics(self._participant) if self._config.diagnostics else None
-        return None if publish is None else DiagnosticsFeed(self._state, self._config.name, publish)
+        topic = open_diagnostics(self._participant) if self._config.diagnostics else None
+        return None if topic is None else DiagnosticsFeed(self._state, self._config.name, *topic)
 
     def _trouble(self) -> str:
         """Return why the master accepts no new work; "" if it does."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 from rosrm.model.diagnostics import Diagnostic
 from rosrm.ros import names, qos
@@ -13,8 +14,15 @@ from rosrm.wording import sanitized, sendable
 _log = logging.getLogger("rosrm.master")
 
 
-def open_diagnostics(participant: Participant) -> Callable[[Sequence[Diagnostic]], None] | None:
-    """Return a function that publishes statuses; None: this ROS installation has no messages."""
+class DiagnosticsTopic(NamedTuple):
+    """Functions that publish statuses, and that return True if another node reads the topic."""
+
+    publish: Callable[[Sequence[Diagnostic]], None]
+    has_reader: Callable[[], bool]
+
+
+def open_diagnostics(participant: Participant) -> DiagnosticsTopic | None:
+    """Return the topic of the statuses; None: this ROS installation has no messages."""
     try:
         from diagnostic_msgs.msg import (  # noqa: PLC0415 - not in every ROS installation
             DiagnosticArray,
@@ -45,7 +53,7 @@ def open_diagnostics(participant: Participant) -> Callable[[Sequence[Diagnostic]
     def publish(statuses: Sequence[Diagnostic]) -> None:
         participant.guard.call(send, statuses)
 
-    return publish
+    return DiagnosticsTopic(publish, lambda: publisher.get_subscription_count() > 0)
 
 
 def _text(text: str) -> str:

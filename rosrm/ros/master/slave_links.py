@@ -57,6 +57,7 @@ class HostLink:
     Attributes:
         slave: the registered slave; None: its key was revoked.
         incarnation: of the run that registered last; messages of a former run are ignored.
+        is_discovered: DDS has discovered the slave's service since its registration.
         deferred: orders and requests of it that wait for its first beat.
         introductions: introductions to it that wait for its first beat.
         outbox: assignments for the answer to its open request.
@@ -68,6 +69,7 @@ class HostLink:
     slave: RegisteredSlave | None
     control: SealedClient
     incarnation: int
+    is_discovered: bool = False
     deferred: list[_Deferred] = field(default_factory=list)
     introductions: list[_Deferred] = field(default_factory=list)
     outbox: list[Assignment] = field(default_factory=list)
@@ -166,7 +168,7 @@ class HostLinks:
         if link is None or link.slave is None or link.slave.peer is not peer:
             link = self._new_link(host_id, description.name, slave)
             self._links[host_id] = link
-        link.slave = slave
+        link.slave, link.is_discovered = slave, False
         link.close_poll()
         if link.incarnation == description.incarnation:
             # The same run again: assignments that it has not fetched stay valid. But it was
@@ -330,7 +332,9 @@ class HostLinks:
             self._handle(_order_answered(command.order_id, response))
 
         def send() -> None:
-            if not link.control.service_is_ready():
+            # Asked only once, because rmw searches the endpoints of all hosts.
+            link.is_discovered = link.is_discovered or link.control.service_is_ready()
+            if not link.is_discovered:
                 self._wait(link, _Deferred(deadline, send, done))
                 return
             beat = int(self.reading_stats.beat[link.host_id])

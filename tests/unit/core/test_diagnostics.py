@@ -132,8 +132,8 @@ class Feed:
     """The statuses that a feed publishes of a cluster."""
 
     def __init__(self, cluster):
-        self.cluster, self.sent, self.seen = cluster, [], 0
-        self.feed = DiagnosticsFeed(cluster.state, "lab", self.sent.append)
+        self.cluster, self.sent, self.seen, self.is_read = cluster, [], 0, True
+        self.feed = DiagnosticsFeed(cluster.state, "lab", self.sent.append, lambda: self.is_read)
 
     def advance(self, now):
         """Pass new events at a time; return what is published as level by kind and name."""
@@ -150,6 +150,17 @@ def test_all_statuses_are_published_each_second_without_a_change(cluster):
     feed = Feed(cluster)
     shown = {("master", "lab"): OK, ("host", "a"): OK, ("process", "broken"): ERROR}
     assert [feed.advance(now) for now in (5.0, 5.5, 6.0)] == [shown, {}, shown]
+
+
+def test_nothing_is_published_without_a_reader(cluster):
+    """Statuses of a thousand hosts are costly; a new reader has all of them after a second."""
+    feed = Feed(cluster)
+    feed.is_read = False
+    assert feed.advance(5.0) == {}
+    cluster.finish("well", code=1)
+    assert feed.advance(5.1) == {}
+    feed.is_read = True
+    assert feed.advance(6.0)["process", "well"] is ERROR
 
 
 def test_a_change_of_a_level_is_published_at_once_and_alone(cluster):

@@ -65,10 +65,11 @@ _ALONE: Final = "there is no other host"
 def evict_from_hosts(state: MasterState, now: float) -> None:
     """Move processes off draining hosts and off hosts over a limit for long enough."""
     _note_limits(state, now)
-    for host in state.hosts.listed():
+    concerned = [one for one in state.hosts.listed() if one.draining or one.over_since]
+    for host in concerned:
         if host.draining:
             _note_drained(state, host, now)
-    for host in state.hosts.listed():
+    for host in concerned:
         if moves_under_way(state) >= state.settings.max_migrations:
             return
         if host.draining:
@@ -81,7 +82,10 @@ def evict_from_hosts(state: MasterState, now: float) -> None:
 def _note_limits(state: MasterState, now: float) -> None:
     """Note for each host the exceeded limits with the times since when they are exceeded."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
-    for host in state.hosts.listed():
+    # Of a thousand hosts few are or were over a limit, so only those are checked.
+    noted = (state.hosts.hosts[column] for column in sorted(over | state.hosts.noted_over))
+    concerned = [host for host in noted if not host.pruned]
+    for host in concerned:
         # A stale reading does not show whether the host is over its limit.
         stale = state.hosts.stale_resources(host) if state.hosts.stale[host.column] else ()
         if host.over_at and state.hosts.condition_of(host) is not HostCondition.UP:
@@ -102,6 +106,7 @@ def _note_limits(state: MasterState, now: float) -> None:
             del host.over_since[name], host.exceeded_since[name]
         if len(host.over_at) > len(names):
             _note_under_limit(state, host, now)
+    state.hosts.noted_over = {host.column for host in concerned if host.over_at or host.over_since}
 
 
 def _note_under_limit(state: MasterState, host: Host, now: float) -> None:

@@ -142,6 +142,7 @@ class HostTable(HostColumns):
         newest_registration: time of the newest registration; -inf: none.
         links: measured links between hosts, and the flows across them.
         claims: column of a host on which room is made for a process -> priority of the process.
+        noted_over: columns of the hosts whose `over_at` or `over_since` has times.
         touched: columns that assignments and ends have changed since `version` grew.
         devices: devices of each host, and the instances that hold them.
     """
@@ -154,6 +155,7 @@ class HostTable(HostColumns):
         self.version = self.version_without_readings = 0
         self.newest_registration = -np.inf
         self.touched: list[int] = []
+        self.noted_over: set[int] = set()
         self.devices = DeviceTable()
         self.claims: dict[int, int] = {}
         self._labelled: dict[tuple[str, str | None], BoolArray] = {}

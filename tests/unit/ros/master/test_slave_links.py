@@ -92,6 +92,19 @@ def test_an_order_waits_until_discovery_finds_the_service_of_the_slave(links, co
     assert links._client.beats == [300]
 
 
+def test_discovery_is_asked_once_for_each_registration(links, control):
+    """The question searches the endpoints of all hosts, so that its cost grows with the cluster."""
+    order = SendOrder(1, HOST, ReportInstances())
+    for sequence, ready in enumerate((True, False), start=1):
+        control.ready = ready
+        links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+        receive_reading(links, beat=100 * sequence, sequence=sequence)
+        links.order(order, now=0.0)
+        control.ready = False
+        links.order(order, now=0.0)
+    assert links._client.beats == [100, 100]
+
+
 def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
     """A host that was cut off has only old readings; an order with their beat would be stale."""
     client = links._client
