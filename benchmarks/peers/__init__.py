@@ -1,1 +1,1 @@
-"""Comparison with Ray, Dask and a bare loop: `python -m benchmarks.peers`."""
+"""Comparison with Ray, Dask, Slurm and a bare loop: `python -m benchmarks.peers`."""

@@ -1,9 +1,10 @@
-"""rosrm, Ray, Dask and a bare loop with the same work on this machine, in turn.
+"""rosrm, Ray, Dask, Slurm and a bare loop with the same work on this machine, in turn.
 
 In each round each system runs, in an environment of its own: `date`, which prints the time as
 its first action, one after the other; 300 times `true` at once; 150 times `sleep 0.1` on three
 slots; 60 processes of 40 MB at once. Ray and Dask are installed into out/peers/ on the first run.
-They keep their state in memory; rosrm writes each job to its journal before it starts.
+They keep their state in memory; rosrm writes each job to its journal before it starts. Slurm takes
+part where its programs are installed and the user is root.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import venv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import which
 from typing import Any, Final
 
 from benchmarks.machine import parser, percentile, print_report, say
@@ -28,6 +30,8 @@ ROOT: Final = Path(__file__).resolve().parents[2]
 _LONGEST: Final = 600.0
 #: Processes of each measurement, as named in the docs.
 _COUNTS: Final = {"stamps": 100, "jobs": 300, "sleeps": 150, "holders": 60}
+#: Programs of Slurm that its runner starts.
+_SLURM: Final = ("munged", "slurmctld", "slurmd", "salloc", "squeue", "sinfo", "srun")
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,9 @@ def main() -> None:
         installed("ray", "ray", options.environments),
         installed("dask", "distributed", options.environments),
     ]
+    left_out = {"slurm": why} if (why := why_no_slurm()) else {}
+    if not left_out:
+        peers.append(Peer("slurm", sys.executable, slurm_version()))
     found: dict[str, dict[str, list[Any]]] = {
         name: {peer.name: [] for peer in peers} for name in options.measurements
     }
@@ -73,6 +80,7 @@ def main() -> None:
                 found[name][peer.name].append(measured(peer, name, _COUNTS[name]))
     figures = figures_of(found)
     figures["peer_versions"] = {peer.name: peer.version for peer in peers if peer.version}
+    figures["left_out"] = left_out
     print_report("peers", figures, runs=options.runs)
 
 
@@ -129,6 +137,20 @@ def _version(python: Path, distribution: str) -> str:
         check=False,
     )  # fmt: skip
     return ended.stdout.strip()
+
+
+def why_no_slurm() -> str:
+    """Return why Slurm cannot be measured here; "": it can."""
+    missing = [name for name in _SLURM if which(name) is None]
+    if missing:
+        return f"{', '.join(missing)}: not found; `apt-get install slurm-wlm munge` has them"
+    return "" if os.geteuid() == 0 else "its daemons need root"
+
+
+def slurm_version() -> str:
+    """Return the version of the installed Slurm."""
+    ended = subprocess.run(["slurmd", "-V"], capture_output=True, text=True, check=True)
+    return ended.stdout.split()[-1]
 
 
 def figures_of(found: Mapping[str, Mapping[str, Sequence[Any]]]) -> dict[str, Any]:
