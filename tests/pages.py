@@ -12,6 +12,9 @@ A mark in the line above a console block says what is different about it:
     <!-- sample: REASON -->       it is run, and of its answers only the first line is compared
     <!-- until: TEXT -->          it is followed by waiting for TEXT in the terminal opened last
 
+A page has fixed numbers for a pid and a port: 4711 is the program that was started last with `&`,
+and 8290 the port of `rosrm web`.
+
 A `pycon` block is a Python session, which doctest compares; those with the mark `<!-- cluster -->`
 need a cluster.
 """
@@ -27,7 +30,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -48,11 +51,17 @@ class Page:
         hosts: that have slaves, beside those of the page.
         cluster: settings of their master.
         files: that lie there already.
+        before: commands that the reader has typed before.
+        criu: it needs CRIU.
+        program: that it needs, and that a machine may lack.
     """
 
     hosts: tuple[str, ...] = ()
     cluster: str = "name: before"
     files: Mapping[str, str] = field(default_factory=dict)
+    before: tuple[str, ...] = ()
+    criu: bool = False
+    program: str = "bash"
 
 
 #: The pages whose commands are run, on a cluster of slices.
@@ -69,6 +78,20 @@ RUN: Final[Mapping[str, Page]] = {
     ),
     "docs/how-to/simulate.md": Page(),
     "docs/how-to/keys.md": Page(),
+    "docs/how-to/adopt.md": Page(hosts=("robot-1",)),
+    "docs/how-to/criu.md": Page(
+        hosts=("robot",),
+        cluster="migration: {strategies: [criu]}",
+        criu=True,
+        files={"brain.yaml": "processes: [{name: brain, command: sleep 1000}]\n"},
+        before=("rosrm submit brain.yaml",),
+    ),
+    "docs/how-to/web.md": Page(
+        hosts=("robot-1", "robot-2"),
+        files={"talker.yaml": "processes: [{name: talker, command: sleep 1000}]\n"},
+        before=("rosrm submit talker.yaml",),
+        program="curl",
+    ),
 }
 #: The pages that are run on virtual hosts, where root is.
 RUN_IN_LAB: Final = "docs/how-to/lab.md"
@@ -81,22 +104,19 @@ NOT_RUN: Final[Mapping[str, str]] = {
     "docs/tutorials/your-own-filter.md": "tests/integration/plugins/test_tutorial.py",
     "docs/tutorials/your-own-probe.md": "tests/integration/plugins/test_tutorial.py",
     "docs/tutorials/your-own-checkpoint-policy.md": "tests/integration/plugins/test_tutorial.py",
-    "docs/how-to/criu.md": "CRIU and what it needs come from the network; tests/integration/criu",
     "docs/how-to/two-machines.md": "two machines",
-    "docs/how-to/wireguard.md": "two machines",
+    "docs/how-to/wireguard.md": "a kernel with WireGuard, and a tunnel between two machines",
     "docs/how-to/docker-or-cgroup.md": "docker",
     "docs/how-to/many-hosts-discovery.md": "a server at an address of its own network",
-    "docs/how-to/adopt.md": "a node of a ROS installation; tests/ros/test_adoption.py adopts one",
     "docs/how-to/alerts.md": "a chat; tests/unit/tools/alerts/test_page.py checks its file",
     "docs/how-to/collected-logs.md": "tests/ros/test_collected_logs.py runs a collector",
     "docs/how-to/reports.md": "its sources are long runs; tests/unit/cli/test_report.py has them",
     "docs/how-to/diagnostics.md": "`ros2` of a ROS installation",
-    "docs/how-to/security.md": "a ROS 2 with DDS security, which the wheels lack",
+    "docs/how-to/security.md": "`ros2 security` and DDS security, both not in the wheels",
     "docs/how-to/ubuntu-24.04-with-apt-ros.md": "apt",
     "docs/how-to/launch-files.md": "`launch` of a ROS installation, which no package index has",
     "docs/reference/metrics.md": "it ends with Ctrl-C; tests/ros/test_web_metrics.py runs it",
     "docs/how-to/documentation.md": "tests/integration/test_docs_site.py builds the site",
-    "docs/how-to/web.md": "it ends with Ctrl-C; tests/ros/test_web.py sends the requests",
     "docs/evaluation.md": "40 minutes; tests/integration/test_paper.py runs its parts",
 }
 
@@ -206,7 +226,7 @@ def matches(shown: str, given: str) -> bool:
 # --- a reader ---------------------------------------------------------------------------------
 
 #: What keeps its terminal until Ctrl-C.
-_STAYS: Final = re.compile(r"(.* )?rosrm (--\S+ \S+ )?(up|master|slave|events -f)\b")
+_STAYS: Final = re.compile(r"(.* )?rosrm (--\S+ \S+ )?(up|master|slave|events -f|web)\b|.* &$")
 _HOSTS: Final = re.compile(r"rosrm up\b(?:.* --hosts (\d+))?")
 
 
@@ -216,12 +236,14 @@ class Reader:
 
     Attributes:
         called: names of this machine, and what the page calls them.
+        learned: pids and addresses of the page, and those of this run.
     """
 
     folder: Path
     domain: int
     environment: dict[str, str] = field(init=False)
     called: dict[str, str] = field(default_factory=dict)
+    learned: dict[str, str] = field(default_factory=dict)
     terminals: list[tuple[str, subprocess.Popen[bytes], Path]] = field(default_factory=list)
     typed: list[str] = field(default_factory=list)
 
@@ -235,6 +257,7 @@ class Reader:
             "HOME": str(self.folder / "home"), "ROS_DOMAIN_ID": str(self.domain),
             "COLUMNS": "140", "NO_COLOR": "1", "PYTHONUNBUFFERED": "1",
         }  # fmt: skip
+        self.called |= {str(Path(sys.executable).parent): "/usr/bin", str(self.folder): "/home/ada"}
         (self.folder / "home").mkdir(parents=True, exist_ok=True)
 
     def follow(self, page: str, setup: Page) -> None:
@@ -255,8 +278,16 @@ class Reader:
     def _prepare(self, setup: Page) -> None:
         for name, text in setup.files.items():
             (self.folder / name).write_text(text, encoding="utf-8")
-        if not setup.hosts:
-            return
+        if setup.criu:  # a page writes the prefix for all users of a host
+            prefix = os.environ.get("ROSRM_CRIU_PREFIX") or str(ROOT / ".venv" / "criu")
+            self.environment["ROSRM_CRIU_PREFIX"] = prefix
+            self.called[prefix] = "/opt/rosrm-criu"
+        if setup.hosts:
+            self._start_cluster(setup)
+        for line in setup.before:
+            self.type(line)
+
+    def _start_cluster(self, setup: Page) -> None:
         (self.folder / "before.cluster.yaml").write_text(setup.cluster, encoding="utf-8")
         self.type("rosrm master --config before.cluster.yaml")
         for host in setup.hosts:
@@ -268,12 +299,16 @@ class Reader:
     def type(self, line: str, answer: str = "", *, whole: bool = True) -> None:
         """Give a command, and see that it does and says what the page shows."""
         self.typed.append(line)
+        for shown, here in self.learned.items():
+            line = line.replace(shown, here)
         if line.startswith("export "):
             shown = dict(word.split("=", 1) for word in line.split()[1:])
             shown.pop("ROS_DOMAIN_ID", None)  # the page's may be taken on this machine
             self.environment.update(shown)
         elif _STAYS.match(line):
             self._open(line)
+            if answer:
+                self._await_answer(answer)
         else:
             self._ask(line, answer, whole=whole)
 
@@ -285,8 +320,7 @@ class Reader:
                 stdin=subprocess.DEVNULL, capture_output=True, timeout=LONG_PATIENCE, check=False,
             )  # fmt: skip
             said = done.stdout if whole else done.stdout.strip().partition("\n")[0]
-            for here, name in self.called.items():
-                said = said.replace(here, name)
+            said = self._as_shown(said)
             assert "Traceback" not in done.stdout + done.stderr, self._story(line, done)
             right = not answer or matches(answer, said)
             if done.returncode == 0 and right:
@@ -297,15 +331,28 @@ class Reader:
             )
             time.sleep(0.5)
 
+    def _as_shown(self, said: str) -> str:
+        """Return an output with the names, pids and addresses of the page."""
+        for here, name in self.called.items():
+            said = said.replace(here, name)
+        for shown, here in self.learned.items():
+            said = re.sub(rf"\b{re.escape(here)}\b", shown, said)
+        return said
+
     def _open(self, line: str) -> None:
         """Start what stays, and wait until its hosts are up."""
+        if line == "rosrm web":
+            line += " --listen 127.0.0.1:0"
         log = self.folder / f"terminal-{len(self.terminals)}.log"
         with log.open("wb") as sink:
             process = subprocess.Popen(
-                ["bash", "-c", f"exec {line}"], cwd=self.folder, env=self.environment,
-                stdin=subprocess.DEVNULL, stdout=sink, stderr=sink, start_new_session=True,
+                ["bash", "-c", f"exec {line.removesuffix('&')}"], cwd=self.folder,
+                env=self.environment, stdin=subprocess.DEVNULL, stdout=sink, stderr=sink,
+                start_new_session=True,
             )  # fmt: skip
         self.terminals.append((line, process, log))
+        if line.endswith("&"):
+            self.learned["4711"] = str(process.pid)
         if "rosrm slave" in line:
             # Of the pages' hosts the first to be started is the first to be given work.
             before = line.partition("rosrm slave")[0]
@@ -319,11 +366,24 @@ class Reader:
         self._ask(f"test $({before}rosrm hosts | grep -cw up) -ge {count}", "", whole=True)
 
     def _await(self, text: str) -> None:
+        self._await_output(lambda said: text in said, text)
+
+    def _await_answer(self, answer: str) -> None:
+        """Wait until the terminal opened last shows an answer; learn the address in it."""
+
+        def is_there(said: str) -> bool:
+            for address in re.findall(r"127\.0\.0\.1:[1-9]\d*", said):
+                self.learned["127.0.0.1:8290"] = address
+            return matches(f"...{answer}...", self._as_shown(said))
+
+        self._await_output(is_there, answer)
+
+    def _await_output(self, is_there: Callable[[str], bool], what: str) -> None:
         line, process, log = self.terminals[-1]
         deadline = time.monotonic() + LONG_PATIENCE
-        while text not in (said := log.read_text(errors="replace")):
+        while not is_there(said := log.read_text(errors="replace")):
             assert process.poll() is None, f"$ {line}\nended with {process.returncode}:\n{said}"
-            assert time.monotonic() < deadline, f"$ {line}\nnever said {text!r}:\n{said}"
+            assert time.monotonic() < deadline, f"$ {line}\nnever said {what!r}:\n{said}"
             time.sleep(0.2)
 
     def _story(self, line: str, done: subprocess.CompletedProcess[str]) -> str:
@@ -353,4 +413,6 @@ class Reader:
 
 
 #: Commands that change nothing, and are given again until they show what the page does.
-_LOOKS: Final = re.compile(r"rosrm (lab )?(ps|hosts|status|explain|events|logs|top|apps|history)\b")
+_LOOKS: Final = re.compile(
+    r"rosrm (lab )?(ps|hosts|status|explain|events|logs|top|apps|history)\b|^curl -s http"
+)

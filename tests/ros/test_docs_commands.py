@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from contextlib import closing
 
 import pytest
@@ -13,7 +14,11 @@ from tests.pages import RUN, Reader
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("page", RUN)
-def test_every_command_of_a_page_does_what_the_page_shows(page, tmp_path):
+def test_every_command_of_a_page_does_what_the_page_shows(page, tmp_path, request):
+    if shutil.which(RUN[page].program) is None:
+        pytest.skip(f"{RUN[page].program} is not installed")
+    if RUN[page].criu:
+        request.getfixturevalue("criu")
     domain, claim = claim_domain()
     with closing(claim), closing(Reader(tmp_path, domain)) as reader:
         reader.follow(page, RUN[page])
