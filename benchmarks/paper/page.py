@@ -35,7 +35,7 @@ def update_page(page: Path, results: Path, names: Iterable[str]) -> None:
     for name in names:
         report = json.loads((results / f"{name}.json").read_text(encoding="utf-8"))
         picture = os.path.relpath(results / f"{name}.png", page.parent)
-        text = _replaced(text, name, section(name, report, picture))
+        text = replaced(text, name, section(name, report, picture))
     page.write_text(text, encoding="utf-8")
 
 
@@ -55,7 +55,8 @@ def _marked(name: str) -> re.Pattern[str]:
     return re.compile(rf"^(<!-- {name} -->\n).*?^(<!-- /{name} -->)$", re.DOTALL | re.MULTILINE)
 
 
-def _replaced(text: str, name: str, content: str) -> str:
+def replaced(text: str, name: str, content: str) -> str:
+    """Return a page with other content between the marks of a name."""
     return _marked(name).sub(lambda found: f"{found[1]}{content}{found[2]}", text)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from rich.table import Table
 
@@ -30,13 +30,13 @@ def show(traces: Mapping[str, Trace], *, as_json: bool) -> None:
     for name, trace in traces.items():
         if len(traces) > 1:
             echo(f"{name}:")
-        tables.show(table(trace))
+        tables.show(table([trace]))
 
 
-def table(trace: Trace) -> Table:
-    """Return the table of one start."""
+def table(traces: Sequence[Trace]) -> Table:
+    """Return the table of one start, or of the medians over several."""
     made = tables.table("HAND-OVER", *_NUMBERS, right=_NUMBERS)
-    for row in hand_overs([trace]):
+    for row in hand_overs(traces):
         made.add_row(row.event, *map(_milliseconds, (row.step_ms, row.since_submit_ms)))
     return made
 
