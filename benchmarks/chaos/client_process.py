@@ -3,19 +3,24 @@
 `submit` and `apply` take the path of a work file, `cancel` names, `migrate` a process and a host.
 `application` returns the state of an application, and why it returned to its former version. `look`
 returns the states of hosts and processes, for the log of a violation, and the silent hosts by the
-master's events, which confirm a measured stall. The client ends when its input ends.
+master's events, which confirm a measured stall. `events` returns the newest events of a process, as
+lines. The client ends when its input ends.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+import time
 from typing import Any
 
-from rosrm import Client, NoMaster, RosrmError
+from rosrm import Client, EventRow, NoMaster, RosrmError
 
 #: Seconds for finding a master; a request has 10.
 _PATIENCE = 3.0
+#: Newest events of a process, and the most letters of one as a line.
+_EVENTS = 25
+_LONGEST = 160
 
 
 def main() -> None:
@@ -48,6 +53,9 @@ def _answer(client: Client, request: dict[str, Any]) -> dict[str, Any]:
         return {"message": client.cancel(request["names"])}
     if request["do"] == "migrate":
         return {"message": client.migrate(request["process"], request["host"])}
+    if request["do"] == "events":
+        events = client.list(events=True, process=request["process"], newest=_EVENTS).events
+        return {"events": [_line_of(one) for one in events]}
     view = client.list(hosts=True, processes=True, events=True, newest=200)
     return {
         "hosts": {row.description.name: row.state for row in view.hosts},
@@ -63,6 +71,11 @@ def _answer(client: Client, request: dict[str, Any]) -> dict[str, Any]:
         ],
         "events": [f"{one.elapsed:.2f} {one.kind}: {one.message}" for one in view.events],
     }
+
+
+def _line_of(event: EventRow) -> str:
+    when = time.strftime("%H:%M:%S", time.localtime(event.wall_time))
+    return f"{when} {event.kind}: {event.message}"[:_LONGEST]
 
 
 if __name__ == "__main__":

@@ -35,6 +35,8 @@ _LOOK_AT_ALL: Final = 0.3
 _STEADY: Final = 2
 #: Seconds within which a requested migration has ended.
 _MOVE: Final = 30.0
+#: Processes of a violation whose events are printed, at most.
+_EXPLAINED: Final = 3
 #: Seconds of a canary: a job that only shows that its host accepts work.
 _CANARY: Final = 0.1
 
@@ -192,7 +194,7 @@ class Trial:
         if not measured:
             return
         since_boot = time.time() - time.monotonic()
-        silent = self._ask_master().get("silent", [])
+        silent = self._ask_master({"do": "look"}).get("silent", [])
         moments = [(wall_time - since_boot, host) for wall_time, host in silent]
         stalls = confirmed(measured, moments, LEASE_S)
         fences = [
@@ -377,20 +379,24 @@ class Trial:
             self._tally.violations[one.kind] += 1
             self._event_log.add(f"VIOLATION ({one.kind}): {one.text}", aloud=True)
         folder = self._out / f"violation-{number}-{self._tally.violations.total()}"
-        names = list({one.name for one in violations if one.name})
+        names = list(dict.fromkeys(one.name for one in violations if one.name))
+        for name in names[:_EXPLAINED]:
+            answer = self._ask_master({"do": "events", "process": name})
+            for line in answer.get("events", [str(answer)]):
+                self._event_log.add(f"master: {line}", aloud=True)
         seen: Mapping[str, Any] = {
             "runs": self._oracle.newest_runs(names),
             "disturbances": [_plain(disturbance) for disturbance in self._disturbances],
             "application": self._rollout.state,
-            "master": self._ask_master(),
+            "master": self._ask_master({"do": "look"}),
         }  # fmt: skip
         self._event_log.keep(folder, self._cluster, [asdict(one) for one in violations], seen)
         say(f"logs: {folder}")
 
-    def _ask_master(self) -> dict[str, Any]:
-        """Return the master's view, for the log and to confirm stalls."""
+    def _ask_master(self, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the master's view or events, for the log and to confirm stalls."""
         answers: list[ClientRequest] = []
-        self._client_load.send(ClientRequest({"do": "look"}, persistent=False, done=answers.append))
+        self._client_load.send(ClientRequest(request, persistent=False, done=answers.append))
         deadline = time.monotonic() + 20.0
         while not answers and time.monotonic() < deadline:
             self._tend()
