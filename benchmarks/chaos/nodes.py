@@ -59,6 +59,7 @@ class Counter(Node):
 
     def restore(self, state: Int64) -> None:
         self.count = state.data
+        self._lines.write("restored", self.count)  # in a standby, after each cycle of its primary
 
 
 def main(arguments: Sequence[str]) -> None:

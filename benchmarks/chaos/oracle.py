@@ -132,7 +132,8 @@ class Oracle:
     def _about_service(
         self, name: str, guarantees: Guarantees, there: list[Member], now: float
     ) -> Iterator[Deviation]:
-        runs = [run for run in self._outputs.read(name) if run.last > now - FRESH]
+        fresh = [run for run in self._outputs.read(name) if run.word_at > now - FRESH]
+        runs = [run for run in fresh if run.last > now - FRESH]
         owners = {run.instance for run in runs}
         if not runs:
             yield Deviation("lost", name, f"{name}: no instance is active; there: {_listed(there)}")
@@ -150,6 +151,8 @@ class Oracle:
             yield Deviation("standby", name, f"{name} has no standby: {_listed(there)}")
         elif guarantees.standby and len({one.host for one in there}) < 2:
             yield Deviation("standby", name, f"{name}: its standby is on the same host")
+        elif guarantees.standby and "restored" not in [run.word for run in fresh]:
+            yield Deviation("standby", name, f"{name}: its standby receives no state")
         if any(size != guarantees.members for size in sizes.values()):
             text = (
                 f"{name}: an instance has {guarantees.members} processes; there: {_listed(there)}"

@@ -13,6 +13,7 @@ import benchmarks.chaos
 from benchmarks.chaos.allowances import OVERLOAD, Disturbance, Guarantees
 from benchmarks.chaos.oracle import AcceptedRequests, Oracle, Versions
 from benchmarks.chaos.outputs import Outputs, Run
+from benchmarks.chaos.reality import Member
 from benchmarks.chaos.rules import (
     Judgement,
     chain,
@@ -289,6 +290,22 @@ def test_all_processes_have_the_version_that_the_application_reports(tmp_path):
     assert [one.kind for one in oracle.deviations()] == ["versions"]
     versions.returned = "a: exit code 3"
     assert oracle.deviations() == []
+
+
+@pytest.mark.parametrize(("line", "deviations"), [("born 0", ["standby"]), ("restored 7", [])])
+def test_a_standby_without_the_state_of_its_primary_is_a_deviation(
+    tmp_path, monkeypatch, line, deviations
+):
+    """A fault in this moment would test no promise: the process starts from its snapshot."""
+    there = [Member(5, "a", "a#1", "host1", "S"), Member(6, "a", "a#2", "host2", "S")]
+    monkeypatch.setattr("benchmarks.chaos.oracle.members", lambda _: there)
+    guarded = {"a": Guarantees(stateful=True, standby=True)}
+    oracle = Oracle("no-lab", tmp_path, AcceptedRequests(services=guarded))
+    now = time.monotonic()
+    (tmp_path / "a").write_text(
+        f"{now} a#1 host1 5 {now} 0 active 8\n{now} a#2 host2 6 {now} 0 {line}\n"
+    )
+    assert [one.kind for one in oracle.deviations()] == deviations
 
 
 def test_lines_become_runs_as_they_grow(tmp_path):
