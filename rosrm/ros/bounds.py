@@ -166,3 +166,10 @@ def _size(message: Any) -> int:
 
 def _beyond(kind: type[Any], field: str, what: str, given: int, most: int) -> Refused:
     return Refused(f"{kind.__name__}.{field} has {given} {what}; at most {most}")
+
+
+def call_bounded(callback: Callable[..., None], *arguments: Any) -> None:
+    """Call a callback whose first argument may be a received message; raise `Refused` for size."""
+    for received in arguments[:1]:
+        check_bounds(received)
+    callback(*arguments)

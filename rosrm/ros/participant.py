@@ -21,7 +21,6 @@ from rclpy.parameter import Parameter
 
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
-from rosrm.ros.bounds import check_bounds
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.fast_dds import Pace, announcing_part, bound
 from rosrm.ros.network_interface import check_interface
@@ -110,10 +109,13 @@ class Participant:
 
         A message of rosrm that exceeds its bounds is dropped, as one whose callback raises.
         """
+        # Imported only here: all messages and numpy take longer than the discovery of a peer, and
+        # a command creates its participant first, so that both run in parallel.
+        from rosrm.ros.bounds import call_bounded  # noqa: PLC0415
 
         def call(*arguments: Any) -> None:
             self._executed += 1
-            self.guard.call(_call_bounded, callback, *arguments)
+            self.guard.call(call_bounded, callback, *arguments)
 
         return call
 
@@ -170,13 +172,6 @@ class Participant:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def _call_bounded(callback: Callable[..., None], *arguments: Any) -> None:
-    """Call a callback whose first argument may be a received message; raise `Refused` for size."""
-    for received in arguments[:1]:
-        check_bounds(received)
-    callback(*arguments)
 
 
 def failed_response(service_type: Any, reason: str, code: str = "failed") -> Any:

@@ -55,3 +55,14 @@ def test_an_error_has_the_same_message_and_exit_code_without_the_parser():
 @pytest.mark.parametrize("words", [(), ("ps", "-a"), ("ps", "--json", "--json"), ("submit",)])
 def test_any_other_line_is_left_to_the_parser(words):
     assert parserless.command(words) is None
+
+
+def test_a_participant_is_created_before_messages_and_numpy_are_imported():
+    """Discovery runs while they are imported, which takes as long."""
+    code = (
+        "import sys, rosrm.cli.early, rosrm.ros.participant\n"
+        "print(*{'numpy', 'rosrm_msgs'} & set(sys.modules))"
+    )
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=60)
+    assert done.stdout == "\n"
