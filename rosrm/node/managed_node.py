@@ -222,6 +222,7 @@ class NodeEntities:
         self.in_cycle = False
         self.sequence += 1
         self.on_cycle()
+        self._replay.after_cycle()
         return result
 
     def _received(self, one: Input, message: Any, info: Any) -> None:

@@ -10,6 +10,10 @@ from rosrm.node.steady_timer import steady_timer
 
 #: Seconds of one slice; a callback that has begun is finished.
 _SLICE: Final = 0.02
+#: Seconds without a cycle after which a node counts as idle.
+_IDLE: Final = 0.02
+#: Seconds after which the further work no longer waits for cycles.
+_MOST_SPREAD: Final = 0.1
 #: Marks the end of the steps.
 _END: Final = object()
 
@@ -28,6 +32,9 @@ class InputReplay:
         self._turn = turn
         self._serve_next = serve_next
         self._timer: Any = None
+        self._pause: Any = None
+        self._is_idle = False
+        self._spread_until = 0.0
         self._beside: Iterator[None] = iter(())
         self._then: Callable[[], None] = lambda: None
         self._counted = 0
@@ -40,10 +47,40 @@ class InputReplay:
     def begin(self, beside: Iterator[None]) -> None:
         """Serve all buffered messages, in slices, from the executor's next round on.
 
-        After each slice the generator `beside` (further work) is advanced by one step.
+        The generator `beside` (further work) is advanced by one step after each slice, then after
+        each cycle, and without a pause once the node is idle. A step takes some ms; just before the
+        next message it would delay that message.
         """
-        self._beside = beside
+        self._beside, self._is_idle = beside, False
+        self._spread_until = time.monotonic() + _MOST_SPREAD
+        self._end_pause()
+        self._pause = steady_timer(self._plain, _IDLE, self._become_idle)
         self._start()
+
+    def after_cycle(self) -> None:
+        """Advance the further work by one step, unless a slice does so."""
+        if self._pause is None or self._timer is not None or not self._advance():
+            return
+        if time.monotonic() < self._spread_until:
+            self._pause.reset()
+
+    def _become_idle(self) -> None:
+        with self._turn:
+            self._end_pause()
+            self._is_idle = True
+            self._start()
+
+    def _advance(self) -> bool:
+        """Do one step of the further work; return False after the last one."""
+        if next(self._beside, _END) is not _END:
+            return True
+        self._end_pause()
+        return False
+
+    def _end_pause(self) -> None:
+        if self._pause is not None:
+            self._plain.destroy_timer(self._pause)
+            self._pause = None
 
     def serve(self, count: int, then: Callable[[], None]) -> None:
         """Serve `count` messages, then call `then`; serve the remaining and new ones after that."""
@@ -61,11 +98,11 @@ class InputReplay:
             try:
                 more = self._serve_until(time.monotonic() + _SLICE)
             finally:
-                steps = next(self._beside, _END) is not _END
+                steps = self._advance()
             if not more or self._counted <= 0:
                 then, self._then = self._then, lambda: None
                 then()
-            if not (more or steps):
+            if not (more or (steps and self._is_idle)):
                 self._plain.destroy_timer(self._timer)
                 self._timer = None
 
