@@ -11,6 +11,7 @@ slave's code. The master publishes its own figures on `master_load`, by its own 
   readings of all hosts.
 - `request_process_*_ms`: one job at a time, from the call of `submit` to the assignment at the
   slave. The master answers one request; the answer reaches the reader of each slave.
+  `assigned_*_ms`: from the same call to the master's record of the assignment.
 
 Where permitted, everything runs in a network namespace of its own and uses UDP, as real hosts do;
 `transports` names the transports used.
@@ -22,6 +23,7 @@ import argparse
 import contextlib
 import itertools
 import json
+import math
 import subprocess
 import sys
 import tempfile
@@ -233,14 +235,23 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
     crowd.toggle()
     taken = {name: at for one in crowd.reports() for name, at in one["taken"].items()}
     took = [1e3 * (taken[name] - called[name]) for name in called if name in taken]
+    decided = [1e3 * (_assigned_at(cluster, name) - at) for name, at in called.items()]
     if not took:
         raise RosrmError(f"no simulated slave got one of {_JOBS} jobs within {_END:g} s")
     return {
+        "assigned_p50_ms": percentile(decided, 0.5),
+        "assigned_p99_ms": percentile(decided, 0.99),
         "request_process_p50_ms": percentile(took, 0.5),
         "request_process_p99_ms": percentile(took, 0.99),
         "request_process_answered": len(took),
         "request_process_asked": _JOBS,
     }
+
+
+def _assigned_at(cluster: LocalCluster, name: str) -> float:
+    """Return the unix time of the record of a job's assignment; infinite: there is none."""
+    events = cluster.client.list(events=True, process=name).events
+    return next((one.wall_time for one in events if one.kind == "assigned"), math.inf)
 
 
 def _wait_for_end(cluster: LocalCluster, name: str) -> None:
