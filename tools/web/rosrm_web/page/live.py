@@ -52,7 +52,7 @@ class Live:
         self.on_change: list[Callable[[], None]] = []
         self._task: asyncio.Task[None] | None = None
         gateway.watcher.on_events.append(self._take_events)
-        gateway.watcher.on_new_journal.append(self.events.clear)
+        gateway.watcher.on_new_journal.append(self._forget_events)
         gateway.watcher.on_master.append(lambda _: self._woken.set())
 
     def join(self, on_change: Callable[[], None]) -> None:
@@ -107,6 +107,10 @@ class Live:
                 self.events.extend(await self._gateway.ask(self._gateway.reading, _newest))
         except RosrmError:
             return  # the watcher has the state of the master
+
+    def _forget_events(self) -> None:
+        self.events.clear()
+        self._woken.set()  # reads those of the new journal, which may be no news to the watcher
 
     def _take_events(self, rows: Sequence[EventRow]) -> None:
         if self.events:
