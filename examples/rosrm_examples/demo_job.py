@@ -25,7 +25,7 @@ HOSTS: Final = ("host1", "host2", "host3")
 APPLICATION: Final = "map"
 MEMORY_LIMIT: Final = 0.8
 #: Stop of a ROS node. On a busy machine its end may take more than the usual 10 s, and a node that
-#: is killed leaves its shared memory. `LocalCluster` waits 30 s for a slave and its processes.
+#: is killed leaves its shared memory. `LocalCluster` waits 60 s for a slave and its processes.
 NODE_STOP: Final = StopPolicy(interrupt_grace=15.0, terminate_grace=5.0)
 #: Bytes of memory in the budget of each host, where the machine has as much.
 BUDGET: Final = 768 * 2**20

@@ -16,7 +16,8 @@ _ADDRESS: Final = "127.0.0.1"
 _USUAL_PORT: Final = 8290
 #: Beginning of the line in which the gateway prints its address.
 _READY: Final = "rosrm web: "
-_END_S: Final = 10.0
+#: Seconds on a busy machine; a gateway that is killed leaves its shared memory.
+_END_S: Final = 30.0
 
 
 class DemoPage:

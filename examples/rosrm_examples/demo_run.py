@@ -19,7 +19,7 @@ from rosrm_examples.demo_page import DemoPage
 from rosrm_examples.demo_record import ENDED, Record
 from rosrm_examples.demo_screen import Screen
 
-_START_S: Final = 30.0
+_START_S: Final = 60.0
 #: Seconds; a demo that takes longer has failed.
 _LONGEST_S: Final = 150.0
 _SAMPLE_S: Final = 0.2
@@ -119,7 +119,8 @@ class Demo:
             self._start_cluster()
             with closing(self._screen):
                 return self._run(script)
-        except RosrmError:
+        except (RosrmError, TimeoutError):
+            self._signals.check()  # which came during a request that failed, such as the first one
             self._check_parts()  # the error of a part that has died is more precise than a timeout
             raise
         finally:

@@ -33,8 +33,9 @@ from rosrm.testing.loopback import settings_on_this_machine
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-#: Seconds for a part to end after SIGINT; its processes have their own grace times.
-_END: Final = 30.0
+#: Seconds for a part to end after SIGINT, on a busy machine; its processes have their own grace
+#: times. A slave that is killed leaves its processes running.
+_END: Final = 60.0
 #: ROS domains whose DDS ports are below the ephemeral range.
 _DOMAINS: Final = range(1, 101)
 #: Participants whose ports are checked, because the first one of a cluster may have ended before

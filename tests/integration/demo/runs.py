@@ -62,7 +62,7 @@ class Run:
             except OSError:
                 continue
 
-    def wait_for(self, what: str, seconds: float = 40.0) -> None:
+    def wait_for(self, what: str, seconds: float = 90.0) -> None:
         """Wait until a line of the progress contains `what`."""
         assert self.demo.stdout is not None
         deadline = time.monotonic() + seconds
