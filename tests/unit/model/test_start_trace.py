@@ -8,7 +8,7 @@ from rosrm.model.values import Assignment, InstanceId, ProcessSpec
 
 
 def test_a_start_without_a_trace_stays_the_same_object() -> None:
-    """A start that nobody traces is neither copied nor changed."""
+    """An untraced start is neither copied nor changed."""
     spec = ProcessSpec("p", command=("true",), environment={"A": "b"})
     assignment = Assignment(InstanceId("p", 1), spec, 1, "p")
     assert stamped_in(spec.environment, decided=1) is spec.environment
