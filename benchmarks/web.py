@@ -62,10 +62,10 @@ _BEFORE = frozenset({"queued", "assigned", "starting"})
 
 
 @contextmanager
-def gateway(cluster: LocalCluster) -> Iterator[tuple[psutil.Process, int]]:
-    """Yield the process and the port of a gateway for a cluster."""
+def gateway(cluster: LocalCluster, *words: str) -> Iterator[tuple[psutil.Process, int]]:
+    """Yield the process and the port of a gateway for a cluster; `words`: its further options."""
     with subprocess.Popen(
-        [sys.executable, "-m", "rosrm.cli", "web", "--listen", "127.0.0.1:0"], text=True,
+        [sys.executable, "-m", "rosrm.cli", "web", "--listen", "127.0.0.1:0", *words], text=True,
         env={**os.environ, **cluster.ros.environment()}, stdout=subprocess.PIPE,
     ) as process:  # fmt: skip
         try:

@@ -8,11 +8,17 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from benchmarks.browser import CHROMIUM, MISSING, browser
+from benchmarks.hosts import three_hosts
+from benchmarks.stopping import own_keys
+from benchmarks.web import gateway
+from rosrm import Client
+from rosrm.testing.local_cluster import LocalCluster
 
 ROOT = Path(__file__).resolve().parent.parent
 PICTURES = ROOT / "docs" / "pictures"
@@ -35,6 +41,7 @@ class Picture(NamedTuple):
     width: int = 1280
     height: int = 800
     scheme: str = "light"
+    token: str = ""  # of an operator; "": the page asks for none
 
 
 def main() -> int:
@@ -58,7 +65,24 @@ def main() -> int:
     finally:
         demo.terminate()
         demo.communicate()
+    with own_keys(), browser() as chromium, tempfile.TemporaryDirectory() as folder:
+        take_plan(chromium, Path(folder))
     return 0
+
+
+def take_plan(chromium: Any, folder: Path) -> None:
+    """Take the plan of a change, on a cluster of its own: the page of a demo only reads."""
+    (folder / "work.yaml").write_text(VERSIONS[0], encoding="utf-8")
+    tokens = folder / "tokens"
+    tokens.touch(0o600)
+    tokens.write_text(f"operator ada {PLAN.token}\n", encoding="ascii")
+    with LocalCluster(folder / "cluster", hosts=three_hosts()) as cluster:
+        client = Client(connection=cluster.client)
+        client.apply([folder / "work.yaml"])
+        client.wait_for_applications(["navigation"], timeout=PATIENCE / 1000)
+        words = ("--tokens", str(tokens), "--allow-actions")
+        with gateway(cluster, *words) as (_, port):
+            take(chromium, f"http://127.0.0.1:{port}/", PLAN)
 
 
 def wait_for(demo: subprocess.Popen[str], what: re.Pattern[str]) -> re.Match[str]:
@@ -77,6 +101,9 @@ def take(chromium: Any, url: str, picture: Picture) -> None:
     context.set_default_timeout(PATIENCE)
     page = context.new_page()
     page.goto(url)
+    if picture.token:
+        page.get_by_label("Token").fill(picture.token)
+        page.get_by_role("button", name="Log in").click()
     page.locator(".ag-row:visible").first.wait_for()
     picture.prepare(page)
     page.wait_for_load_state("networkidle")
@@ -124,6 +151,30 @@ def open_logs(page: Any) -> None:
     page.get_by_role("dialog").get_by_text("wrote").wait_for(state="detached")
 
 
+def open_plan(page: Any) -> None:
+    """Plan the second version of an application."""
+    open_tab(page, "Applications")
+    page.get_by_role("button", name="Plan a change").click()
+    dialog = page.get_by_role("dialog")
+    dialog.get_by_label("Work file", exact=True).fill(VERSIONS[1])
+    dialog.get_by_role("button", name="Plan", exact=True).click()
+    dialog.get_by_role("button", name="Apply:").wait_for()
+
+
+#: An application, and its next version.
+VERSIONS = (
+    """app: navigation
+processes:
+  - {name: planner, command: sleep 1000}
+  - {name: mapper, command: sleep 1000}
+""",
+    """app: navigation
+processes:
+  - {name: planner, command: sleep 2000}
+  - {name: camera, command: sleep 1000}
+  - {name: giant, command: sleep 1000, needs: {memory: 90GiB}}
+""",
+)
 PICTURES_OF_A_FULL_QUEUE = (
     Picture("hosts", lambda _: None, height=420),
     Picture("processes", open_processes),
@@ -134,6 +185,7 @@ PICTURES_OF_A_FULL_QUEUE = (
     Picture("phone", open_processes, width=390, height=700),
 )
 TIMELINE = Picture("timeline", open_timeline)
+PLAN = Picture("plan", open_plan, token="0123456789abcdef" * 2)
 
 
 if __name__ == "__main__":
