@@ -19,7 +19,7 @@ def test_times_are_beyond_the_bare_spawn_of_the_same_round():
 
 
 def test_slurm_is_left_out_with_the_reason(monkeypatch, tmp_path):
-    """Where a program of it is missing, or the user is not root."""
+    """A program of Slurm is missing, or the user is not root."""
     monkeypatch.setenv("PATH", str(tmp_path))
     assert why_no_slurm().startswith("munged, slurmctld, slurmd, ")
     for name in ("munged", "slurmctld", "slurmd", "salloc", "squeue", "sinfo", "srun"):
