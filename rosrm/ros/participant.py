@@ -24,6 +24,7 @@ from rosrm.ros import qos
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.fast_dds import Pace, announcing_part, bound
 from rosrm.ros.network_interface import check_interface
+from rosrm.runtime.timer_slack import use_exact_timers
 from rosrm.version import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
@@ -79,6 +80,7 @@ class Participant:
             # `rclpy.init`, this installs no signal handlers.
             self.context.init(domain_id=settings.domain, initialize_logging=False)
             self.node = self._lean_node(name)
+        use_exact_timers()
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)
         self._executed = 0

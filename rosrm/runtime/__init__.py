@@ -10,6 +10,7 @@ disk_space.py      free space on the disk of a directory
 settings_check.py  check of a settings file, in a process of its own
 parent_death.py    end of a process with its parent
 oom_score.py       protection of an agent from the OOM killer
+timer_slack.py     exact ends of the waits of a process
 worker.py          a thread for blocking work of a loop
 ros_wheels.py      the environment of ROS 2 from wheels
 """

@@ -18,12 +18,13 @@ def main() -> None:
     sys.path.append(os.path.dirname(package))  # last: the standard library takes precedence
 
     # ruff: noqa: PLC0415 - these can be imported only now
-    from rosrm.runtime import oom_score
+    from rosrm.runtime import oom_score, timer_slack
     from rosrm.supervisor import descriptors, endpoint
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 
     state, *limits = sys.argv[1:]
+    timer_slack.use_usual_timers()  # for the processes of users
     oom_score.protect()  # the slave, which cannot do it either then, logs why
     try:
         listener = endpoint.listen(state)
