@@ -97,7 +97,7 @@ def test_a_request_to_a_killed_master_reports_its_wait_and_can_be_ended(make_clu
         began = time.monotonic()
         with pytest.raises(Enough):
             client.list(on_wait=on_wait)
-        assert time.monotonic() - began < 5.0
+        assert time.monotonic() - began < PATIENCE / 2  # the request itself would take all of it
     assert len(waits) > 5
 
 

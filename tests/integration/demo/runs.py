@@ -79,7 +79,11 @@ class Run:
             self.look()
             with suppress(subprocess.TimeoutExpired):
                 self.demo.wait(1.0)
-        output, errors = self.demo.communicate(timeout=1.0)
+        has_ended = self.demo.poll() is not None
+        if not has_ended:
+            self.kill()
+        output, errors = self.demo.communicate(timeout=20.0)
+        assert has_ended, f"the demo did not end in {seconds:g} s: {output}{errors}"
         return self.demo.returncode, output, errors
 
     def check_clean(self) -> None:
@@ -109,11 +113,11 @@ class Run:
         return path.stat().st_ctime > self.began
 
     def kill(self) -> None:
-        for pid in self.processes():
-            try:
-                os.kill(pid, signal.SIGKILL)
-            except ProcessLookupError:
-                continue
+        """Kill all processes, also those that start during the search for them."""
+        while found := self.processes():
+            for pid in found:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
         self.demo.communicate()
 
 
