@@ -130,7 +130,8 @@ def _read_text(content: bytes, at: int) -> tuple[str, int]:
     begin, end = at + 4, at + 4 + length
     if end > len(content):
         raise _short()
-    return content[begin : end - 1 if length else end].decode("utf-8", "replace"), end
+    # As in rclpy, a text ends at its first NUL, which no path or argument may have.
+    return content[begin:end].split(b"\0", 1)[0].decode("utf-8", "replace"), end
 
 
 def _number_reader(code: str) -> _Reader:

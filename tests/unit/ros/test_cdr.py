@@ -90,6 +90,13 @@ def test_a_message_that_ends_early_is_refused() -> None:
         cdr.read(srv.Submit.Request, b"\0\0" + data[2:])
 
 
+def test_a_text_ends_at_its_first_nul() -> None:
+    """Of a foreign sender too, because no path or argument may have a NUL."""
+    data = serialize_message(msg.ProcessSpec(name="camera")).replace(b"camera", b"cam\0ra")
+    assert cdr.read(msg.ProcessSpec, data).name == "cam"
+    assert cdr.read(msg.ProcessSpec, data) == deserialize_message(data, msg.ProcessSpec)
+
+
 def test_a_made_message_has_its_fields() -> None:
     """It is the message of the constructor."""
     spec = msg.ProcessSpec(name="a")
