@@ -119,9 +119,11 @@ class InstanceGroups:
         for tree in self.trees:
             needs = self._needs(tree, limits, realtime=bool(limits.policy))
             if made and tree not in made and needs:
+                path = _path(tree, key)
+                self._emptied.pop(path, None)  # otherwise the moved processes would be killed
                 with contextlib.suppress(OSError):
-                    _make(_path(tree, key), tree)
-                    _move_all(_path(made[0], key), _path(tree, key))
+                    _make(path, tree)
+                    _move_all(_path(made[0], key), path)
                     self._made[key] = (*self._made[key], tree)
 
     def lacking(self, key: Key, limits: LimitRule) -> dict[str, str]:

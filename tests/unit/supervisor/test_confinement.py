@@ -151,6 +151,23 @@ def test_a_limit_that_could_not_be_set_at_the_start_is_set_with_the_next_change(
     assert (group / "memory.limit_in_bytes").read_text() == "100000000"
 
 
+def test_a_group_added_to_a_running_instance_waits_for_no_removal(tmp_path: Path) -> None:
+    """Otherwise a group left from the run before would be removed, and its processes killed."""
+    trees = [Tree(1, str(tmp_path / name), str(tmp_path), (name,)) for name in ("memory", "cpu")]
+    groups, limits = InstanceGroups(trees), LimitRule(cpu=1.0)
+    for tree in trees:
+        Path(tree.top).mkdir()
+    groups.make(KEY, limits, realtime=False)
+    left = tmp_path / "cpu" / "camera.1"
+    (left / "cgroup.procs").touch()  # the kernel has not released the last process yet
+    groups.remove(KEY, 0.0)
+    groups.make(KEY, LimitRule(), realtime=False)
+    assert groups.deadline() is not None
+    groups.add(KEY, limits)
+    assert groups.deadline() is None
+    assert groups.lacking(KEY, limits) == {}
+
+
 class Closed(InstanceGroups):
     """Groups that can be made, and that no process can enter."""
 
