@@ -118,6 +118,8 @@ class ReplicationService:
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a snapshot; None: the local search is running.
         self._preparing: dict[InstanceId, Fetch | None] = {}
+        #: Instances whose local search, which also stores their keys, is running.
+        self._searching: set[InstanceId] = set()
         self._parts_waiting = 0
         self._snapshots = self._store.scan()
         self._reported: tuple[SnapshotReport, ...] | None = None
@@ -178,7 +180,8 @@ class ReplicationService:
 
     def ended(self, instance: InstanceId) -> None:
         """Forget the key of an instance that has ended without a snapshot."""
-        if self._store.keys.may_have(instance.process):  # most have none
+        # Most instances have none, and need no job of the thread.
+        if instance in self._searching or self._store.keys.may_have(instance.process):
             drop = partial(self._store.keys.drop, instance.process, instance.number)
             self._in_thread(drop, lambda _: None)
 
@@ -345,6 +348,7 @@ class ReplicationService:
         if not assignment.has_snapshots:
             return True
         self._preparing[assignment.instance] = None
+        self._searching.add(assignment.instance)
         unkeyed = replace(assignment, state_key=b"")  # the key stays in the store
         self._in_thread(
             partial(self._look_for, assignment),
@@ -371,6 +375,7 @@ class ReplicationService:
     ) -> None:
         """Fetch a newer snapshot from another host, if there is one."""
         instance, hosts = assignment.instance, assignment.snapshot_hosts
+        self._searching.discard(instance)
         if found.fault:
             _log.info("the replica here is not used for %s: %s", instance, found.fault)
         if instance not in self._preparing:

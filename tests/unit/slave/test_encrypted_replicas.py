@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import threading
 import zlib
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from rosrm.slave.replication.encryption import encrypted
 from rosrm.slave.replication.keys import KEY
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import TransferPart, checked
-from tests.unit.slave.test_replication import P7, Net, assignment, prepare
+from tests.unit.slave.test_replication import P7, PATIENCE, Net, assignment, prepare
 from tests.unit.slave.test_snapshot_store import snapshot
 
 ONE, OTHER = bytes(range(32)), bytes(32)
@@ -143,6 +144,20 @@ def test_an_ended_instance_leaves_no_key_behind(net):
     net.slaves["a"].ended(InstanceId("p", 8))
     net.settle()
     assert not net.directory("a").exists()
+
+
+def test_an_instance_that_ends_during_its_local_search_leaves_no_key_behind(net):
+    """The search, which stores the key, may begin only after the end."""
+    net.add("a")
+    slave, free = net.slaves["a"], threading.Event()
+    slave._jobs.put(lambda: free.wait(PATIENCE))
+    given = assignment(number=8, state_key=ONE)
+    slave.prepare(given, lambda _: None)
+    slave.forget(given.instance)
+    slave.ended(given.instance)
+    free.set()
+    net.settle()
+    assert not (net.directory("a") / KEY).exists()
 
 
 def test_launchers_and_supervisor_get_no_key(net):
