@@ -44,7 +44,10 @@ def demand_of(state: MasterState, process: Process) -> Demand:
 
 
 def ranking_of(state: MasterState, demand: Demand) -> Ranking:
-    """Return the current ranking of all hosts for a demand; only assignments update it in place."""
+    """Return the current ranking of all hosts for a demand.
+
+    Assignments and readings update it in place; other changes of the hosts make it void.
+    """
     if state.rankings_version != state.hosts.version:
         state.rankings = _kept(state.rankings)
         state.demands.clear()
