@@ -71,6 +71,8 @@ def submit(
 
     if as_json and not trace:
         raise ConfigError("submit: --json is for the output of --trace; add --trace, or omit it")
+    if as_json and wait:
+        raise ConfigError("submit: --wait prints no JSON; omit --wait or --json")
     limit = longest(timeout)
     specs = [spec for file in files for spec in load_work(file)]
     left = "the submitted processes stay queued or run (`rosrm ps`)"

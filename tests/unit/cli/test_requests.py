@@ -110,6 +110,13 @@ def test_submit_json_without_a_trace_is_refused(rosrm, client, work):
     assert "--json is for the output of --trace" in result.err
 
 
+def test_submit_json_with_wait_is_refused(rosrm, client, work):
+    """The summary of the wait would follow the JSON."""
+    result = rosrm("submit", work, "--trace", "--json", "--wait")
+    assert (result.code, client.asked) == (2, [])
+    assert "--wait prints no JSON" in result.err
+
+
 def test_submit_refuses_a_wrong_file_before_it_looks_for_a_master(rosrm, client, tmp_path):
     (tmp_path / "w.yaml").write_text("processes: [{name: a, comand: x}]", encoding="utf-8")
     result = rosrm("submit", tmp_path / "w.yaml")
