@@ -21,6 +21,7 @@ def test_fast_dds_is_given_a_profile_while_the_node_is_made():
         (profile,) = set(environment) - {"HOME"}
         text = Path(environment[profile]).read_text()
     assert "heartbeatPeriod" in text
+    assert "initialAcknackDelay" in text
     assert ET.fromstring(text.split("-->", 1)[1]).tag.endswith("profiles")
     assert environment == {"HOME": "/home/robot"}
 
@@ -109,6 +110,7 @@ def test_a_bound_participant_has_one_transport_with_one_interface(pace, before):
     assert profile.find("participant/rtps/useBuiltinTransports", names).text == "false"
     assert profile.find(".//initialAnnouncements/count", names).text == "60"
     assert profile.find(".//leaseDuration/sec", names).text == str(LEASE)
+    assert profile.find(".//initialAcknackDelay/nanosec", names).text == "1000000"
     assert (profile.find(".//heartbeatPeriod", names) is not None) == (pace == "steady")
 
 
