@@ -69,10 +69,14 @@ def reason(cluster: Cluster, name: str, host: str) -> str:
     return str(next(one["reason"] for one in hosts if one["name"] == host))
 
 
-def round_trip(cluster: Cluster, name: str) -> float:
-    """Return the measured round trip of the only flow of a process; 0: it is not measured yet."""
+def measured(cluster: Cluster, name: str, what: str) -> float:
+    """Return the `round_trip` or `link_rate` of the only flow of a process; 0: not known yet."""
     (flow,) = explained(cluster, name)["flows"]
-    return float(flow["round_trip"] or 0.0)
+    return float(flow[what] or 0.0)
+
+
+def round_trip(cluster: Cluster, name: str) -> float:
+    return measured(cluster, name, "round_trip")
 
 
 def delayed(lab: Lab, host: str, seconds: float) -> bool:
@@ -94,6 +98,10 @@ def test_measured_links_decide_where_processes_run(cluster) -> None:
     cluster.submit(process("camera", **robot), viewer)
     near = cluster.wait("a round trip", lambda: round_trip(cluster, "viewer"), bool)
     assert near < 1.0
+    cluster.wait(
+        "the robot's report of its link", lambda: measured(cluster, "viewer", "link_rate"),
+        lambda rate: rate == RATE,
+    )  # fmt: skip
     if delayed(lab, "robot-1", 0.2):
         cluster.wait("the delay", lambda: round_trip(cluster, "viewer"), lambda it: 0.4 <= it < 2.0)
         lab.delay("robot-1", 0.0)
