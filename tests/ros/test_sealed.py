@@ -104,6 +104,7 @@ def stage():
 
 def test_a_forged_answer_of_a_second_server_is_dropped(stage: Stage) -> None:
     """The stranger answers first, and cannot read the request."""
+    stage.parts.reverse()  # so that the stranger's turn is before the master's
     stage.serve()
     client = stage.client()
     recorded = stage.record_requests()
