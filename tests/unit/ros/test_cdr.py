@@ -91,14 +91,14 @@ def test_a_message_that_ends_early_is_refused() -> None:
 
 
 def test_a_text_ends_at_its_first_nul() -> None:
-    """Of a foreign sender too, because no path or argument may have a NUL."""
+    """No path or argument may have a NUL, also from a foreign sender."""
     data = serialize_message(msg.ProcessSpec(name="camera")).replace(b"camera", b"cam\0ra")
     assert cdr.read(msg.ProcessSpec, data).name == "cam"
     assert cdr.read(msg.ProcessSpec, data) == deserialize_message(data, msg.ProcessSpec)
 
 
 def test_a_made_message_has_its_fields() -> None:
-    """It is the message of the constructor."""
+    """The constructor returns the same message."""
     spec = msg.ProcessSpec(name="a")
     fields = {name: getattr(spec, name) for name in spec.get_fields_and_field_types()}
     assert cdr.made(msg.ProcessSpec, **fields) == spec
