@@ -139,9 +139,10 @@ def has_terminal() -> bool:
 
 
 def end_start() -> None:
-    """Exclude all objects of the start from garbage collection, because they stay; then begin it.
+    """Exclude the objects of the start from garbage collection, and enable the collector.
 
-    With Python's default thresholds a burst of submissions would take a third longer.
+    Those objects stay until the end. With Python's default thresholds a burst of submissions would
+    take a third longer.
     """
     gc.collect()
     gc.freeze()

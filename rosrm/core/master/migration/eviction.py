@@ -82,7 +82,7 @@ def evict_from_hosts(state: MasterState, now: float) -> None:
 def _note_limits(state: MasterState, now: float) -> None:
     """Note for each host the exceeded limits with the times since when they are exceeded."""
     over = {int(column) for column in state.hosts.hosts_over_limit()}
-    # Of a thousand hosts few are or were over a limit, so only those are checked.
+    # Only hosts that are or were over a limit are checked, because most hosts never are.
     noted = (state.hosts.hosts[column] for column in sorted(over | state.hosts.noted_over))
     concerned = [host for host in noted if not host.pruned]
     for host in concerned:
