@@ -160,7 +160,7 @@ def test_a_damaged_state_gives_way_to_the_one_before(stage, tmp_path):
     second = stage.instance(Counter, 1, keep=tmp_path)
     stage.spin_until(lambda: second.count > 0, "a count")
     assert second._rosrm.entities.sequence <= before.sequence + 1
-    assert second.count > 20
+    assert second.count >= before.sequence > 0
     crash(stage, second)
     for path, _ in reader.snapshot_files(tmp_path):
         path.write_bytes(b"nonsense")

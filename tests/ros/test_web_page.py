@@ -249,6 +249,7 @@ def test_a_process_is_checkpointed_and_restored(criu, chromium, make_cluster, to
         cluster.wait("held", "checkpointed")
         assert page.get_by_role("button", name="Restore").count() == 0
         page.keyboard.press("Escape")
+        page.get_by_role("dialog").wait_for(state="hidden")
         row(page, "held").filter(has_text="checkpointed").dblclick()
         act(page, "Restore", "continues from its image")
         cluster.wait("held", "running")
