@@ -40,6 +40,7 @@ BESIDE: Final[dict[str, str]] = {
     "spawned": "supervisor: has spawned the process",
     "client_answered": "client: has received the answer",
 }
+_EVENTS: Final = STAMPS | BESIDE
 #: Digits of a unix time in nanoseconds.
 _DIGITS: Final = 19
 #: Bytes at the beginning of a log in which the stamps are looked for.
@@ -70,7 +71,7 @@ class HandOver:
 def hand_overs(traces: Sequence[Trace]) -> list[HandOver]:
     """Return the table of one or several starts."""
     rows, before = [], ""
-    for stamp, event in (STAMPS | BESIDE).items():
+    for stamp, event in _EVENTS.items():
         step = _median_ms(traces, before, stamp) if stamp in STAMPS else None
         rows.append(HandOver(stamp, event, step, _median_ms(traces, "client_sent", stamp)))
         before = stamp
@@ -95,7 +96,7 @@ def stamps_in_log(lines: Iterable[str]) -> dict[str, int]:
             words = (word.partition("=") for word in line.removeprefix(LINE).split())
             # A repeated stamp is that of a repeated delivery, so the first one counts.
             for name, _, at in words:
-                if name in STAMPS | BESIDE and _is_time(at):
+                if name in _EVENTS and _is_time(at):
                     stamps.setdefault(name, int(at))
         elif not own and _is_time(line):
             own = int(line)
