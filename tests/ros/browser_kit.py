@@ -6,12 +6,19 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
+from axe_playwright_python.sync_playwright import Axe
+
 from tests.waiting import PATIENCE
 
 #: Seconds for one step of a page: on a busy machine a browser, a gateway and a cluster share a CPU.
 BROWSER_PATIENCE = 3 * PATIENCE
 #: Link of `tab` over a bad mobile network: milliseconds of delay, bytes per second.
 SLOW_LINK = {"latency": 400, "downloadThroughput": 250_000, "uploadThroughput": 60_000}
+
+_ALL_ROWS_HAVE_CELLS = """
+    [...document.querySelectorAll("[role=row]")].every(
+        row => row.querySelector("[role=columnheader], [role=rowheader], [role=gridcell]"))
+"""
 
 
 @contextmanager
@@ -55,3 +62,14 @@ def row(page: Any, name: str) -> Any:
 def open_tab(page: Any, name: str) -> None:
     """Show the tab of this name."""
     page.get_by_role("tab", name=name).click()
+
+
+def serious_findings(page: Any) -> list[tuple[str, str]]:
+    """Return what axe-core calls serious or critical: rules, and the first element of each.
+
+    A table's row is drawn before its cells, so this waits for them first.
+    """
+    page.wait_for_function(_ALL_ROWS_HAVE_CELLS)
+    found = Axe().run(page).response["violations"]
+    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    return [(one["id"], one["nodes"][0]["html"][:200]) for one in serious]

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 
 from rosrm.config.modes import load_modes
 from rosrm.config.work import load_application
-from tests.ros.browser_kit import open_tab, row, tab
+from tests.ros.browser_kit import open_tab, row, serious_findings, tab
 from tests.ros.clusters import STEADY, Cluster, host
 from tests.ros.web_kit import gateway
 from tests.waiting import wait_until
@@ -193,10 +192,7 @@ def test_no_serious_finding_in_the_tab_and_a_dialog(chromium, web, scheme):
     """axe-core checks names, roles and contrasts."""
     with tab(chromium, web.url, color_scheme=scheme) as page:
         log_in(page)
-        found = Axe().run(page).response["violations"]
+        assert serious_findings(page) == []
         dialog = plan(page, work(f"axe-{scheme}", f"checked-{scheme}"))
         dialog.get_by_role("button", name="Apply: start 1").wait_for()
-        found += Axe().run(page).response["violations"]
-
-    serious = [one for one in found if one["impact"] in ("serious", "critical")]
-    assert [(one["id"], one["nodes"][0]["html"][:200]) for one in serious] == []
+        assert serious_findings(page) == []

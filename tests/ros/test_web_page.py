@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 
 from rosrm.archive.layout import Source
 from rosrm.archive.retention import ArchiveLimits
@@ -17,7 +16,7 @@ from rosrm.archive.writer import ArchiveWriter
 from rosrm.config.settings import MigrationSettings
 from rosrm.model.rows import LogPart
 from rosrm.model.values import MigrationPolicy
-from tests.ros.browser_kit import SLOW_LINK, open_tab, row, tab
+from tests.ros.browser_kit import SLOW_LINK, open_tab, row, serious_findings, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
@@ -159,10 +158,7 @@ def test_no_serious_finding_of_an_accessibility_checker(chromium, web, scheme):
     """Names, roles and contrasts of the page, by axe-core."""
     with tab(chromium, web.url, color_scheme=scheme) as page:
         row(page, "robot-1").wait_for()
-        found = Axe().run(page).response["violations"]
-
-    serious = [one for one in found if one["impact"] in ("serious", "critical")]
-    assert [(one["id"], one["nodes"][0]["html"][:200]) for one in serious] == []
+        assert serious_findings(page) == []
 
 
 def test_the_page_fits_a_phone(chromium, web):

@@ -6,10 +6,9 @@ import re
 from typing import Any
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 
 from rosrm.model.values import MigrationPolicy
-from tests.ros.browser_kit import tab
+from tests.ros.browser_kit import serious_findings, tab
 from tests.ros.clusters import STEADY, Cluster, host, job, service
 from tests.ros.web_kit import Gateway, gateway
 
@@ -150,10 +149,7 @@ def test_no_serious_finding_of_an_accessibility_checker(chromium, web, scheme):
     with tab(chromium, web.url, color_scheme=scheme) as page:
         open_timeline(page)
         mark(page, "loser").wait_for()
-        found = Axe().run(page).response["violations"]
-
-    serious = [one for one in found if one["impact"] in ("serious", "critical")]
-    assert [(one["id"], one["nodes"][0]["html"][:200]) for one in serious] == []
+        assert serious_findings(page) == []
 
 
 def test_the_timeline_fits_a_phone(chromium, web):

@@ -9,14 +9,19 @@ import pytest
 
 from rosrm.core.supervisor.events import RestartOrdered
 from rosrm.model.values import InstanceState
+from tests.waiting import wait_until
 
 #: Prints only that the secret has arrived, not the secret.
 SHOW = "import os, time; print(len(os.environ['TOKEN']), flush=True); time.sleep(1000)"
 
 
 def secret_of(pid: int) -> bytes:
-    """Return the value of TOKEN in the environment of a process."""
-    variables = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
+    """Return the value of TOKEN in the environment of a process.
+
+    The kernel lets the parent of a new process go on before the environment can be read.
+    """
+    environment = Path(f"/proc/{pid}/environ")
+    variables = wait_until(environment.read_bytes, f"the environment of {pid}").split(b"\0")
     return next(one.removeprefix(b"TOKEN=") for one in variables if one.startswith(b"TOKEN="))
 
 
