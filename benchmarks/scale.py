@@ -12,6 +12,12 @@ slave's code. The master publishes its own figures on `master_load`, by its own 
 - `request_process_*_ms`: one job at a time, from the call of `submit` to the assignment at the
   slave. The master answers one request; the answer reaches the reader of each slave.
   `assigned_*_ms`: from the same call to the master's record of the assignment.
+- `request_process_master_cpu_ms`, `request_process_slaves_cpu_ms`: CPU for each of these jobs of
+  the master, and of all simulated slaves, beyond their CPU without jobs.
+
+With several numbers (`--slaves 1000 5000 1000 5000`), each is measured in turn. `cost_ratio` is the
+cost of a slave-cycle (`us_per_message`) with the most slaves over that with the fewest, of the
+medians. All have the same `--hz`: reduce it until the machine can offer it for the most slaves.
 
 Where permitted, everything runs in a network namespace of its own and uses UDP, as real hosts do;
 `transports` names the transports used.
@@ -24,15 +30,18 @@ import contextlib
 import itertools
 import json
 import math
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from benchmarks.machine import isolated_transports, parser, percentile, print_report, say
 from benchmarks.simulated_slaves import STEP
@@ -222,9 +231,16 @@ def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:
     }
 
 
-def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
-    """Return the delays from submission to the assignment at the slave, one job at a time."""
+def requests(cluster: LocalCluster, crowd: Crowd, idle: Mapping[str, float]) -> dict[str, float]:
+    """Return the delays from submission to the assignment at the slave, one job at a time.
+
+    Args:
+        cluster: of the master.
+        crowd: the slaves.
+        idle: the figures of the readings, without jobs.
+    """
     crowd.toggle()
+    began, cpu = time.monotonic(), _cpu_of_master(cluster)
     called = {}
     for number in range(_JOBS):
         name = f"job{number}"
@@ -233,7 +249,12 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
         cluster.client.spin(_PAUSE)
     _wait_for_end(cluster, name)
     crowd.toggle()
-    taken = {name: at for one in crowd.reports() for name, at in one["taken"].items()}
+    reports = crowd.reports()
+    taken = {name: at for one in reports for name, at in one["taken"].items()}
+    master = _cpu_of_master(cluster) - cpu - idle["master_cpu"] * (time.monotonic() - began)
+    slaves = sum(
+        one["cpu"] - idle["simulated_slaves_cpu"] / len(reports) * one["seconds"] for one in reports
+    )
     took = [1e3 * (taken[name] - called[name]) for name in called if name in taken]
     decided = [1e3 * (_assigned_at(cluster, name) - at) for name, at in called.items()]
     if not took:
@@ -243,9 +264,17 @@ def requests(cluster: LocalCluster, crowd: Crowd) -> dict[str, float]:
         "assigned_p99_ms": percentile(decided, 0.99),
         "request_process_p50_ms": percentile(took, 0.5),
         "request_process_p99_ms": percentile(took, 0.99),
+        "request_process_master_cpu_ms": 1e3 * master / _JOBS,
+        "request_process_slaves_cpu_ms": 1e3 * slaves / _JOBS,
         "request_process_answered": len(took),
         "request_process_asked": _JOBS,
     }
+
+
+def _cpu_of_master(cluster: LocalCluster) -> float:
+    assert cluster.master is not None
+    used = psutil.Process(cluster.master.process.pid).cpu_times()
+    return float(used.user + used.system)
 
 
 def _assigned_at(cluster: LocalCluster, name: str) -> float:
@@ -265,12 +294,13 @@ def _wait_for_end(cluster: LocalCluster, name: str) -> None:
 
 
 def measure(
-    arguments: argparse.Namespace, folder: Path, security: SecurityMode = "keys"
+    arguments: argparse.Namespace, slaves: int, folder: Path, security: SecurityMode = "keys"
 ) -> dict[str, float]:
     """Return all figures of one run.
 
     Args:
         arguments: of the command line.
+        slaves: number of them.
         folder: for the state of the master.
         security: of the cluster.
 
@@ -279,7 +309,8 @@ def measure(
         TimeoutError: no message of the master came.
     """
     with ExitStack() as opened:
-        cluster = LocalCluster(folder, ClusterConfig(security=security))
+        most = max(slaves, ClusterConfig().max_hosts)
+        cluster = LocalCluster(folder, ClusterConfig(security=security, max_hosts=most))
         opened.callback(cluster.close)
         assert cluster.domain is not None
         cluster.start_master()
@@ -289,13 +320,24 @@ def measure(
         crowd = Crowd(cluster.domain, arguments.hz, arguments.step, arguments.timeout, security)
         opened.callback(crowd.close)
         begun = time.monotonic()
-        crowd.start(arguments.slaves, arguments.processes)
+        crowd.start(slaves, arguments.processes)
         up = time.monotonic() - begun
-        say(f"{arguments.slaves} slaves are registered after {up:.1f} s")
+        say(f"{slaves} slaves are registered after {up:.1f} s")
         loads.wait(arguments.settle)
         figures = readings(crowd, loads, arguments.seconds)
         say(f"{figures['us_per_message']:.1f} us a slave-cycle, {figures['missed']} missed")
-        return {**figures, **requests(cluster, crowd), "all_registered_s": up}
+        return {**figures, **requests(cluster, crowd, figures), "all_registered_s": up}
+
+
+def _costs(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
+    """Return the figures of one run; of several, each one's and the ratio of their costs."""
+    if len(runs) == 1:
+        return dict(runs[0])
+    costs: dict[float, list[float]] = {}
+    for one in runs:
+        costs.setdefault(one["slaves"], []).append(one["us_per_message"])
+    least, most = (statistics.median(costs[end(costs)]) for end in (min, max))
+    return {"cost_ratio": most / least, "by_turns": list(runs)}
 
 
 def main() -> int:
@@ -304,8 +346,9 @@ def main() -> int:
     command_line.add_argument(
         "--slaves",
         type=_positive(int),
-        default=1000,
-        help="number of simulated slaves",
+        nargs="+",
+        default=[1000],
+        help="number of simulated slaves; of several numbers, each is measured in turn",
     )
     command_line.add_argument(
         "--hz",
@@ -342,20 +385,21 @@ def main() -> int:
         help="seconds from the registration to the measurement",
     )
     arguments = command_line.parse_args()
-    if arguments.processes > arguments.slaves:
+    if arguments.processes > min(arguments.slaves):
         command_line.error(
-            f"{arguments.slaves} slaves cannot share {arguments.processes} processes"
+            f"{min(arguments.slaves)} slaves cannot share {arguments.processes} processes"
         )
     transports = isolated_transports()
-    with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
-        figures = measure(arguments, Path(folder))
+    runs = []
+    for slaves in arguments.slaves:
+        with tempfile.TemporaryDirectory(prefix="rosrm-scale-") as folder:
+            runs.append({"slaves": slaves, **measure(arguments, slaves, Path(folder))})
     print_report(
         "scale",
         {
-            "slaves": arguments.slaves, "hz": arguments.hz, "step": arguments.step, **figures,
-            "transports": transports,
+            "hz": arguments.hz, "step": arguments.step, **_costs(runs), "transports": transports,
         },
-        runs=1,
+        runs=len(runs),
     )  # fmt: skip
     return 0
 

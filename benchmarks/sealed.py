@@ -92,7 +92,7 @@ def slave_cycles(options: argparse.Namespace) -> dict[str, Pair]:
 
     def cost(security: SecurityMode) -> float:
         with tempfile.TemporaryDirectory(prefix="rosrm-sealed-") as folder:
-            return scale.measure(options, Path(folder), security)["us_per_message"]
+            return scale.measure(options, options.slaves, Path(folder), security)["us_per_message"]
 
     return {"us_per_slave_cycle": _by_turns(options.rounds, cost)}
 
