@@ -71,6 +71,13 @@ def test_a_counter_out_of_range_does_not_open(counter: int) -> None:
     assert Opener(KEY).open(counter, Sealer(KEY).seal(b"x")) is None
 
 
+@pytest.mark.parametrize("part", [Sealer, Opener])
+def test_a_key_of_another_length_is_refused(part: type) -> None:
+    """A shorter key would make libsodium read beyond its end."""
+    with pytest.raises(ValueError, match="a key has 32 bytes, this one has 31"):
+        part(bytes(31))
+
+
 def test_each_use_has_a_key_of_its_own() -> None:
     """Directions, runs, channels (by name and by type), principals and generations differ."""
     secret = ClusterSecret(bytes(32))
