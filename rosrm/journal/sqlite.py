@@ -17,6 +17,7 @@ from typing import Any, Final
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.lazy import mapping_to_json
 from rosrm.model.records import Intent, Record, StoredRecord
 from rosrm.runtime.private_files import make_private_directory, make_private_file
 
@@ -152,7 +153,7 @@ class SqliteJournal:
             database.executemany(
                 "INSERT OR REPLACE INTO intent VALUES (?, ?, ?)",
                 [
-                    (table, key, _to_json(value))
+                    (table, key, mapping_to_json(value))
                     for (table, key), value in intents.items()
                     if value is not None
                 ],
@@ -215,7 +216,7 @@ def _row(stored: StoredRecord) -> Row:
     record = stored.record
     return (
         stored.sequence, stored.wall_time, stored.elapsed, str(record.kind), record.process,
-        record.host, record.message, _to_json(record.facts),
+        record.host, record.message, mapping_to_json(record.facts),
     )  # fmt: skip
 
 
@@ -226,17 +227,3 @@ def _facts(text: str) -> Mapping[str, Any]:
     except ValueError:
         facts = None
     return facts if isinstance(facts, dict) else {"unreadable": text}
-
-
-def _plain(value: object) -> object:
-    """Return the JSON equivalent of a read-only mapping or numpy number."""
-    if isinstance(value, Mapping):
-        return dict(value)
-    item = getattr(value, "item", None)
-    if callable(item):
-        return item()
-    raise TypeError(f"{type(value).__name__} is no JSON")
-
-
-#: Made once, because `json.dumps` with a `default` makes an encoder for each call.
-_to_json: Final = json.JSONEncoder(default=_plain).encode

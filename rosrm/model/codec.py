@@ -58,6 +58,21 @@ def fields_to_plain(value: Any, names: Iterable[str]) -> dict[str, Any]:
     return plain
 
 
+def _plain(value: object) -> object:
+    """Return the JSON equivalent of a read-only mapping or numpy number."""
+    if isinstance(value, Mapping):
+        return dict(value)
+    item = getattr(value, "item", None)
+    if callable(item):
+        return item()
+    raise TypeError(f"{type(value).__name__} is no JSON")
+
+
+#: Encodes plain values. Made once, because `json.dumps` with a `default` makes an encoder for each
+#: call.
+to_json: Final = json.JSONEncoder(default=_plain).encode
+
+
 @_compiled_once
 def _writer(kind: Any) -> _Convert:
     if is_dataclass(kind):

@@ -24,7 +24,6 @@ from rosrm.core.master.state.hosts import Host, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.intents import Unsaved, mode_intent, modes_intent, version_intent
 from rosrm.core.master.state.journal_gap import JournalGap
-from rosrm.core.master.state.lazy import Plain
 from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
 from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration
@@ -51,6 +50,7 @@ from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import ChainOf, PlacementPlugins, PolicySettings
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.lazy import Plain
 from rosrm.model.modes import Mode
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record

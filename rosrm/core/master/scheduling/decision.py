@@ -24,11 +24,11 @@ from rosrm.core.master.scheduling.host_views import host_view, process_view
 from rosrm.core.master.scheduling.proximity import unmet
 from rosrm.core.master.scheduling.ranking import TIE, Ranking
 from rosrm.core.master.state.host_arrays import FloatArray
-from rosrm.core.master.state.lazy import Lazy
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Scores
 from rosrm.extensions.placement import ScoringLink
 from rosrm.extensions.plugin_calls import PluginCalls, required
+from rosrm.model.lazy import Lazy
 from rosrm.model.values import EMPTY
 from rosrm.wording import first_line
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Final
 
-from rosrm.core.master.state.lazy import Plain
 from rosrm.model.applications import RolloutPolicy
 from rosrm.model.codec import fields_from_plain, fields_to_plain, from_plain
+from rosrm.model.lazy import Plain
 from rosrm.model.values import ProcessSpec
 
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.lazy import Plain
 from rosrm.model.codec import fields_from_plain, fields_to_plain, to_plain
 from rosrm.model.devices import HeldDevice
+from rosrm.model.lazy import Plain
 from rosrm.model.plan import Aim, Commit, Plan, ReportPhase, Step
 from rosrm.model.values import InstanceId, InstanceStatus, ProcessSpec
 from rosrm.wording import first_line

@@ -12,9 +12,9 @@ from rosrm.core.master.graph_names import node_of
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
-from rosrm.core.master.state.lazy import Plain
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.lazy import Plain
 from rosrm.model.values import GroupEnd, InstanceId, InstanceState, Kind, ProcessSpec
 
 #: Principal and name of a gang.

@@ -1,0 +1,38 @@
+"""Lazy mappings: rendered and encoded once, however many rows of the journal contain them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+
+from rosrm.model.lazy import Lazy, mapping_to_json
+
+
+class Counted(Lazy):
+    """A mapping that counts how often it is rendered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def render(self) -> Mapping[str, Any]:
+        self.count += 1
+        return {"reason": 'it is "full"', "limits": {"cpu": 0.5}}
+
+
+@pytest.mark.parametrize("others", [{}, {"number": 3, "devices": []}])
+def test_the_text_of_a_lazy_value_is_inserted(others: Mapping[str, Any]) -> None:
+    """The JSON of a mapping has the same values, rendered late or not, as only or as one entry."""
+    text = mapping_to_json({"decision": Counted(), **others})
+    assert json.loads(text) == {"decision": Counted().render(), **others}
+
+
+def test_a_lazy_value_is_rendered_once() -> None:
+    """The rows of the journal, and a reader after them, share one rendering."""
+    lazy = Counted()
+    assert mapping_to_json({"spec": lazy}) == mapping_to_json({"spec": lazy})
+    assert lazy["limits"] == {"cpu": 0.5}
+    assert lazy.count == 1
