@@ -8,6 +8,7 @@ starts one. The supervisor imports this module: it stays small.
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from typing import Final
 
@@ -52,5 +53,8 @@ def score_of_children() -> Iterator[None]:
 
 
 def _set(score: int) -> None:
-    with open(_FILE, "w", encoding="ascii") as file:
-        file.write(str(score))
+    descriptor = os.open(_FILE, os.O_WRONLY | os.O_CLOEXEC)
+    try:
+        os.write(descriptor, b"%d" % score)
+    finally:
+        os.close(descriptor)

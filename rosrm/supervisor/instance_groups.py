@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
-from rosrm.supervisor import own_log
+from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
 from rosrm.wording import size
@@ -82,14 +82,14 @@ class InstanceGroups:
                 no real-time scheduling, and whose limits have no effect on it.
         """
         faults: dict[str, str] = {}
-        made = []
+        made, is_new = [], True
         for tree in self.trees:
             if not self._needs(tree, limits, realtime=realtime):
                 continue
             path = _path(tree, key)
             self._emptied.pop(path, None)  # otherwise the new run would be killed
             try:
-                _make(path, tree)
+                is_new = _make(path, tree) and is_new
                 made.append(tree)
                 faults.update(_set_limits(path, tree, limits))
             except OSError as error:
@@ -100,7 +100,7 @@ class InstanceGroups:
                 )  # fmt: skip
         self._made[key] = tuple(made)
         self._unset[key] = {name.removeprefix("limits."): 0.0 for name in faults}
-        self._kills_before[key] = self._kills(key)
+        self._kills_before[key] = 0 if is_new else self._kills(key)
         return faults
 
     def _needs(self, tree: Tree, limits: LimitRule, *, realtime: bool) -> bool:
@@ -258,9 +258,9 @@ def remove_empty(group: str) -> None:
 def pids(group: str) -> list[int]:
     """Return the other processes in a group and those below it; [] if it is gone."""
     try:
-        with open(os.path.join(group, "cgroup.procs"), "rb") as file:
-            # 0: a process outside of our pid namespace; a signal to 0 would reach ourselves.
-            found = [int(pid) for pid in file.read().split() if int(pid) not in (0, os.getpid())]
+        listed = map(int, procfs.content(os.path.join(group, "cgroup.procs")).split())
+        # 0: a process outside of our pid namespace; a signal to 0 would reach ourselves.
+        found = [pid for pid in listed if pid not in (0, os.getpid())]
         has_groups = os.stat(group).st_nlink > _LINKS
     except OSError:
         return []
@@ -364,13 +364,16 @@ def _above(path: str, tree: Tree, limits: LimitRule) -> str:
     return _uses(used, limits) if used > limits.memory else ""
 
 
-def _make(path: str, tree: Tree) -> None:
+def _make(path: str, tree: Tree) -> bool:
+    """Make a group; return False if it is that of a former run, with its counters."""
     try:
         os.mkdir(path)
-    except FileExistsError:  # of a former run; a new one has new counters
-        with contextlib.suppress(OSError):
+    except FileExistsError:
+        try:
             os.rmdir(path)
             os.mkdir(path)
+        except OSError:
+            return False
     except FileNotFoundError:  # the first one, or another supervisor removed the group above
 
         def make_both() -> None:
@@ -378,6 +381,7 @@ def _make(path: str, tree: Tree) -> None:
             os.mkdir(path)
 
         make_repeatedly(make_both)
+    return True
 
 
 def _move_all(source: str, target: str) -> None:

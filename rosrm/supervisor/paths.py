@@ -33,10 +33,12 @@ _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ012345678
 
 def safe_name(process: str) -> str:
     """Return the name of a process as a file name; different names stay different."""
-    safe = "".join(
-        c if c in _SAFE else "".join(f"%{b:02X}" for b in os.fsencode(c)) for c in process
-    )
+    safe = process if _SAFE.issuperset(process) else "".join(map(_safe_letter, process))
     return "%2E" + safe[1:] if safe.startswith(".") else safe
+
+
+def _safe_letter(letter: str) -> str:
+    return letter if letter in _SAFE else "".join(f"%{b:02X}" for b in os.fsencode(letter))
 
 
 def log_folder(state: str) -> str:

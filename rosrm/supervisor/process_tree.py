@@ -139,11 +139,12 @@ class ProcessTrees:
 
     def reap(self) -> None:
         """Take the exit status of every child that has ended, and report the ends of leaders."""
-        ended = []
+        ended, has_children = [], True
         while True:
             try:
                 pid, status, usage = os.wait4(-1, os.WNOHANG)
             except ChildProcessError:
+                has_children = False
                 break
             if pid == 0:
                 break
@@ -158,11 +159,12 @@ class ProcessTrees:
                     usage.ru_maxrss * 1024.0,
                     usage.ru_utime + usage.ru_stime,
                     self._has_others(key, pid),
-                    self._groups.out_of_memory(key),
+                    self._groups.out_of_memory(key) if code else None,
                 )
                 ended.append((pid, exited))
         if ended:
-            self._look_at_adopted()
+            if has_children:  # otherwise none was adopted
+                self._look_at_adopted()
             owners = set(self._adopted.values())
             for pid, exited in ended:
                 self._leader_ended(pid, exited, exited.instance in owners)

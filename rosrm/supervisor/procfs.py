@@ -25,6 +25,8 @@ _KERNEL_THREAD: Final = 0x200000
 #: Longest duration of an execve, and the interval between two checks of one, seconds.
 _EXECVE: Final = 1.0
 _LOOK: Final = 0.001
+#: Most bytes of one read.
+_PART: Final = 1 << 16
 
 
 class Stat(NamedTuple):
@@ -62,6 +64,23 @@ def read_stat(pid: int) -> Stat | None:
         pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19]),
         int(fields[6]),
     )  # fmt: skip
+
+
+def content(path: str) -> bytes:
+    """Return the content of a file that the kernel generates.
+
+    The file objects of Python make four further system calls for each file.
+
+    Raises:
+        OSError: it cannot be opened or read.
+    """
+    file, parts = os.open(path, os.O_RDONLY | os.O_CLOEXEC), []
+    try:
+        while part := os.read(file, _PART):
+            parts.append(part)
+    finally:
+        os.close(file)
+    return b"".join(parts)
 
 
 def inner_pid(pid: int, thread: int = 0) -> int:
@@ -192,8 +211,7 @@ def own_children() -> list[int]:
     """Return the pids of this process's children, adopted ones included."""
     me = os.getpid()
     try:
-        with open(f"/proc/self/task/{me}/children", "rb") as file:
-            return [int(pid) for pid in file.read().split()]
+        return [int(pid) for pid in content(f"/proc/self/task/{me}/children").split()]
     except FileNotFoundError:  # a kernel without CONFIG_PROC_CHILDREN
         return [stat.pid for stat in everyone() if stat.parent == me]
 

@@ -485,8 +485,9 @@ class Server:
             self._part(connection)
             return
         writes = selectors.EVENT_WRITE if connection.has_unsent else 0
-        call = self._selector.get_key(connection).data
-        self._selector.modify(connection, selectors.EVENT_READ | writes, call)
+        watched = self._selector.get_key(connection)
+        if watched.events != selectors.EVENT_READ | writes:
+            self._selector.modify(connection, selectors.EVENT_READ | writes, watched.data)
 
     def _part(self, connection: Connection) -> None:
         if connection.fileno() < 0:
