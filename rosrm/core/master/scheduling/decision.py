@@ -64,30 +64,16 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The part of one policy in the scores of a decision; `scores` None: the policy failed."""
+    """The part of one policy in a decision.
+
+    Attributes:
+        scores: None: the policy failed.
+        reasons: row to the policy's reason for the score of the host, or for the veto on it.
+    """
 
     link: ScoringLink
     scores: Scores | None
-    plugins: PluginCalls
-
-    def vetoes(self, at: int) -> bool:
-        """Return True if the policy vetoes a host."""
-        return (
-            self.scores is not None and self.scores.veto is not None and bool(self.scores.veto[at])
-        )
-
-    def reason(self, at: int, *, veto: bool) -> str:
-        """Return the policy's own reason, or a note that the policy failed."""
-        if self.scores is None:
-            return ""
-        ask = self.scores.veto_reason if veto else self.scores.reason
-        hook = "veto_reason" if veto else "reason"
-        try:
-            return self.plugins.ask(
-                "scoring", self.link.name, hook, lambda: required(ask(at), str), self.scores
-            )
-        except PluginError as error:
-            return f"(no reason, because the policy failed: {error})"
+    reasons: Mapping[int, str]
 
 
 @dataclass(slots=True)  # not frozen, because that costs 1 µs for each of thousands
@@ -106,11 +92,39 @@ class Moment:
     value: FloatArray
     standing: tuple[Refusal | None, ...]
 
-    def parts(self) -> list[Part]:
-        """Return the scores of each policy again, for their reasons (a policy is pure)."""
+    def parts(self, refused: Sequence[Refusal | None]) -> list[Part]:
+        """Return the scores of each policy again, with its reasons (a policy is pure).
+
+        `refused`: for each host the filter that it failed, so that a veto needs no reason.
+        """
         if not len(self.hosts):
             return []
-        return [Part(link, _scores_of(link, self.hosts), self.plugins) for link in self.judges]
+        fits = (self.value < np.inf).tolist()
+        scored = [at for at, fit in enumerate(fits) if fit]
+        others = [at for at, fit in enumerate(fits) if not fit and refused[at] is None]
+        return [self._part(link, scored, others) for link in self.judges]
+
+    def _part(self, link: ScoringLink, scored: Sequence[int], others: Sequence[int]) -> Part:
+        scores = _scores_of(link, self.hosts)
+        if scores is None:
+            return Part(link, None, {})
+        vetoed = [at for at in others if scores.veto is not None and scores.veto[at]]
+        reasons = self._reasons(link, scores, "reason", scored)
+        return Part(link, scores, reasons | self._reasons(link, scores, "veto_reason", vetoed))
+
+    def _reasons(
+        self, link: ScoringLink, scores: Scores, hook: str, rows: Sequence[int]
+    ) -> dict[int, str]:
+        """Return the policy's own reasons, asked in one guarded call; a note if that failed."""
+        ask = getattr(scores, hook)
+
+        def reasons() -> dict[int, str]:
+            return {at: required(ask(at), str) for at in rows}
+
+        try:
+            return self.plugins.ask("scoring", link.name, hook, reasons, scores) if rows else {}
+        except PluginError as error:
+            return dict.fromkeys(rows, f"(no reason, because the policy failed: {error})")
 
     @property
     def plugins(self) -> PluginCalls:
@@ -206,7 +220,7 @@ def why_each_refuses(ranking: Ranking, columns: Sequence[int]) -> list[tuple[str
     """
     moment = _moment(ranking, list(columns))
     refused = moment.refusals()
-    parts = moment.parts() if None in refused else ()
+    parts = moment.parts(refused) if None in refused else ()
     return [
         (
             moment.hosts.host(at).name,
@@ -232,7 +246,8 @@ def _moment(ranking: Ranking, columns: list[int]) -> Moment:
 
 def _verdicts(moment: Moment, *, chosen: bool) -> tuple[Verdict, ...]:
     """Return the verdicts on the hosts of a moment; `chosen`: the first host was chosen."""
-    parts, refused = moment.parts(), moment.refusals()
+    refused = moment.refusals()
+    parts = moment.parts(refused)
     return tuple(
         _verdict(moment, parts, refused[at], at, chosen=chosen and at == 0)
         for at in range(len(moment.hosts))
@@ -255,9 +270,9 @@ def _verdict(
 def _sum(parts: Sequence[Part], at: int) -> str:
     """Return the reasons for the score of a host; of a chain with the score of each policy."""
     if len(parts) == 1 and parts[0].link.weight == 1.0:
-        return parts[0].reason(at, veto=False)
+        return parts[0].reasons.get(at, "")
     return " + ".join(
-        f"{part.link} {part.scores.value[at]:.3f} ({part.reason(at, veto=False)})"
+        f"{part.link} {part.scores.value[at]:.3f} ({part.reasons[at]})"
         for part in parts
         if part.scores is not None
     )
@@ -265,10 +280,10 @@ def _sum(parts: Sequence[Part], at: int) -> str:
 
 def _vetoes(parts: Sequence[Part], at: int) -> str:
     """Return the reason of each veto on a host; of a chain with the name of the policy."""
-    vetoes = [part for part in parts if part.vetoes(at)]
+    vetoes = [part for part in parts if at in part.reasons]
     if len(parts) == 1:
-        return "".join(part.reason(at, veto=True) for part in vetoes)
-    return "; ".join(f"{part.link.name}: {part.reason(at, veto=True)}" for part in vetoes)
+        return "".join(part.reasons[at] for part in vetoes)
+    return "; ".join(f"{part.link.name}: {part.reasons[at]}" for part in vetoes)
 
 
 def _scores_of(link: ScoringLink, hosts: Candidates) -> Scores | None:
