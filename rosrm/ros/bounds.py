@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 
 from rosrm.errors import Refused
 from rosrm.ros import sealed_codec
+from rosrm.ros.remembered import remembered
 from rosrm_msgs import msg
 
 #: Most letters of a text, and most entries of a sequence.
@@ -22,6 +23,8 @@ MOST_ENTRIES: Final = 1 << 16
 #: Most letters and entries of a whole message, and of the spec of one process.
 LARGEST_MESSAGE: Final = 1 << 26
 LARGEST_SPEC: Final = 1 << 20
+#: Most letters and entries of a nested message whose size is remembered.
+_MOST_REMEMBERED: Final = 512
 
 _OTHER_LETTERS: Final = {
     "Sealed.principal": sealed_codec.MOST_LETTERS,
@@ -97,12 +100,14 @@ class Bound(NamedTuple):
 
     Attributes:
         field: its name.
+        slot: attribute of messages that has its value; the property of its name is slower.
         entries: most entries; 0: it is no sequence.
         letters: most letters of the text, or of each text in the sequence; 0: it has none.
         nested: messages are in it.
     """
 
     field: str
+    slot: str
     entries: int
     letters: int
     nested: bool
@@ -120,7 +125,7 @@ def _find_bounds(kind: Any) -> tuple[Bound, ...]:
         letters = _OTHER_LETTERS.get(name, MOST_LETTERS) if inner == "string" else 0
         nested = inner.startswith("rosrm_msgs/") and _has_bounds(inner)
         if entries or letters or nested:
-            found.append(Bound(field, entries, letters, nested))
+            found.append(Bound(field, f"_{field}", entries, letters, nested))
     return tuple(found)
 
 
@@ -147,8 +152,8 @@ def check_bounds(message: Any) -> int:
 
 def _size(message: Any) -> int:
     kind, size = type(message), 0
-    for field, entries, letters, nested in bounds_of(kind):
-        value = getattr(message, field)
+    for field, slot, entries, letters, nested in bounds_of(kind):
+        value = getattr(message, slot)
         if entries:
             if len(value) > entries:
                 raise _beyond(kind, field, "entries", len(value), entries)
@@ -159,9 +164,11 @@ def _size(message: Any) -> int:
                     raise _beyond(kind, field, "letters", len(text), letters)
                 size += len(text)
         elif nested:
-            for part in value if entries else (value,):
-                size += _size(part)
+            size += sum(map(_size, value)) if entries else _size_of_known(value)
     return size
+
+
+_size_of_known: Final = remembered(_size, lambda size: size <= _MOST_REMEMBERED)
 
 
 def _beyond(kind: type[Any], field: str, what: str, given: int, most: int) -> Refused:

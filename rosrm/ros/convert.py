@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import is_dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
-from typing import Any, Final, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Final, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
 
 from rosrm.errors import Refused
 from rosrm.keys.derivation import KEY_BYTES
@@ -45,6 +45,7 @@ from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceR
 from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
 from rosrm.ros.cdr import made
+from rosrm.ros.remembered import remembered
 from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
 
@@ -67,7 +68,9 @@ _STATES: Final = frozenset(state.value for state in values.InstanceState)
 
 def pairs(values: Mapping[str, Any]) -> list[msg.KeyValue]:
     """Return a mapping of strings as messages."""
-    return [msg.KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    if not values:
+        return []
+    return [made(msg.KeyValue, key=key, value=str(value)) for key, value in values.items()]
 
 
 def mapping(values: Iterable[msg.KeyValue]) -> dict[str, str]:
@@ -110,36 +113,63 @@ _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     tuple[int, ...]: (list, lambda numbers: tuple(map(int, numbers))),
     Mapping[str, str]: (pairs, mapping),
     Mapping[str, values.StartCondition]: (pairs, mapping),
-    values.Kind: (attrgetter("value"), values.Kind),
-    values.InstanceState: (attrgetter("value"), values.InstanceState),
+    # Not `value`, which is a property in Python.
+    values.Kind: (attrgetter("_value_"), values.Kind),
+    values.InstanceState: (attrgetter("_value_"), values.InstanceState),
 }
 
 
-def _fields(kind: Any) -> tuple[tuple[str, str, _Convert, _Convert], ...]:
-    """Return name, name in the message and conversions of each field; `kind` is a dataclass."""
-    return tuple(
-        (name, _RENAMED.get(name, name), *_forms(hint))
-        for name, hint in get_type_hints(kind).items()
-    )
+class _Field(NamedTuple):
+    """A field of a dataclass, and of messages.
+
+    Attributes:
+        name: in the dataclass.
+        there: in messages.
+        slot: attribute of messages that has its value; the property `there` is slower.
+        to_msg: converts its value to that in messages.
+        from_msg: the inverse of `to_msg`.
+    """
+
+    name: str
+    there: str
+    slot: str
+    to_msg: _Convert
+    from_msg: _Convert
+
+
+def _fields(kind: Any) -> tuple[_Field, ...]:
+    """Return the fields of a dataclass."""
+    found = []
+    for name, hint in get_type_hints(kind).items():
+        there = _RENAMED.get(name, name)
+        # The property makes an array of numbers.
+        slot = there if hint == tuple[int, ...] else f"_{there}"
+        found.append(_Field(name, there, slot, *_forms(hint)))
+    return tuple(found)
 
 
 #: Typed, because mypy does not accept a type as an argument of a cache.
-_known_fields: Final[Callable[[Any], tuple[tuple[str, str, _Convert, _Convert], ...]]] = cache(
-    _fields
-)
+_known_fields: Final[Callable[[Any], tuple[_Field, ...]]] = cache(_fields)
 
 
 def _forms(hint: Any) -> tuple[_Convert, _Convert]:
     if isinstance(hint, type) and is_dataclass(hint):
-        return partial(_to_msg, getattr(msg, hint.__name__)), partial(_from_msg, hint)
+        there, back = _dataclass_forms(hint)
+        # A user may change a mapping between two submissions.
+        is_fixed = all(get_origin(one) is not Mapping for one in get_type_hints(hint).values())
+        return remembered(there) if is_fixed else there, remembered(back)
     inner = get_args(hint)[0] if get_origin(hint) is tuple else None
     if isinstance(inner, type) and is_dataclass(inner) and hasattr(msg, inner.__name__):
-        there, back = _forms(inner)
+        there, back = _dataclass_forms(inner)
         return (
             lambda items: [there(item) for item in items],
             lambda items: tuple(back(item) for item in items),
         )
     return _FORMS.get(hint, (_unchanged, _unchanged))
+
+
+def _dataclass_forms(kind: Any) -> tuple[_Convert, _Convert]:
+    return partial(_to_msg, getattr(msg, kind.__name__)), partial(_from_msg, kind)
 
 
 def _unchanged(value: Any) -> Any:
@@ -148,19 +178,19 @@ def _unchanged(value: Any) -> Any:
 
 def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
     """Return a dataclass as a message of a type with the same fields; `others` are converted."""
-    same = {
-        there: convert(getattr(value, name))
-        for name, there, convert, _ in _known_fields(type(value))
-        if there not in others
-    }
-    return made(message, **same, **others)
+    converted = made(message, **others)
+    for name, there, slot, convert, _ in _known_fields(type(value)):
+        if there not in others:
+            field = getattr(value, name)
+            setattr(converted, slot, field if convert is _unchanged else convert(field))
+    return converted
 
 
 def _from_msg(wanted: type[_Value], message: Any, /, **others: Any) -> _Value:
     """Return the inverse of `_to_msg`."""
     same = {
-        name: convert(getattr(message, there))
-        for name, there, _, convert in _known_fields(wanted)
+        name: convert(getattr(message, slot))
+        for name, _, slot, _, convert in _known_fields(wanted)
         if name not in others
     }
     return wanted(**same, **others)
@@ -189,7 +219,7 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
         ],
         needs=_amounts_to_msg(spec.needs),
         migration=_to_msg(
-            msg.MigrationPolicy, spec.migration, options=json.dumps(dict(spec.migration.options))
+            msg.MigrationPolicy, spec.migration, options=_json_text(spec.migration.options)
         ),
         talks_to=[
             msg.ProcessFlow(process=name, rate=float(rate)) for name, rate in spec.talks_to.items()
@@ -240,6 +270,10 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
     return spec
+
+
+def _json_text(mapping: Mapping[str, Any]) -> str:
+    return json.dumps(dict(mapping)) if mapping else "{}"
 
 
 def _json_pairs(parameters: Mapping[str, Any]) -> list[msg.KeyValue]:
@@ -557,7 +591,8 @@ def _json_value(text: str, what: str) -> Any:
 def assignment_to_msg(assignment: values.Assignment) -> msg.Assignment:
     """Return an order to run an instance as a message."""
     fence = assignment.fence or values.Fence(0.0, 0.0)
-    return msg.Assignment(
+    return made(
+        msg.Assignment,
         instance=instance_to_msg(assignment.instance), epoch=assignment.epoch,
         node_name=assignment.node_name, shadow=assignment.shadow,
         fence_after=float(fence.after), fence_grace=float(fence.grace),

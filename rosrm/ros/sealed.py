@@ -68,7 +68,7 @@ def sealed(
     """
     run = peer.run if answered is None else answered.run
     context = run if answered is None else answered.reference
-    done = peer.link.seal(channel, serialize_message(message), context)
+    done = peer.link.seal(channel, cdr.form_of(message), context)
     return Envelope(FORMAT, peer.name, peer.generation, done.run, run, done.counter, done.body)
 
 

@@ -45,8 +45,8 @@ def test_the_fields_with_a_bound_exist() -> None:
 
 def test_texts_and_sequences_without_a_bound_of_their_own_have_the_general_one() -> None:
     by_field = {bound.field: bound for bound in bounds_of(msg.MasterBeat)}
-    assert by_field["name"] == ("name", 0, MOST_LETTERS, False)
-    assert by_field["silent_hosts"] == ("silent_hosts", MOST_ENTRIES, 0, False)
+    assert by_field["name"] == ("name", "_name", 0, MOST_LETTERS, False)
+    assert by_field["silent_hosts"] == ("silent_hosts", "_silent_hosts", MOST_ENTRIES, 0, False)
 
 
 def many(kind, count: int):
