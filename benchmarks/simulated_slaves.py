@@ -25,12 +25,12 @@ import select
 import socket
 import sys
 import time
+from array import array
 from collections.abc import Sequence
 from dataclasses import fields
 from typing import NoReturn
 
 import numpy as np
-import numpy.typing as npt
 
 from benchmarks.machine import say
 from benchmarks.shared_participant import BerthEndpoints, SharedParticipant, Tally
@@ -97,16 +97,20 @@ class Walks:
         self._random = np.random.default_rng(slaves)
         self._step = step
         self._used = self._random.uniform(*_BETWEEN, (slaves, len(_RESOURCES)))
-        self.usage = np.zeros((slaves, RESOURCE_SLOTS), np.float32)
-        self.limit = np.ones(RESOURCE_SLOTS, np.float32)
-        self.limit[: len(_RESOURCES)] = _LIMIT
+        self._usage = np.zeros((slaves, RESOURCE_SLOTS), np.float32)
+        self.limit = array("f", len(_RESOURCES) * [_LIMIT])
+        self.limit.extend((RESOURCE_SLOTS - len(_RESOURCES)) * [1.0])
         self.go_on()
 
     def go_on(self) -> None:
         """Advance all readings by one cycle."""
         self._used += self._random.normal(0.0, self._step, self._used.shape)
         np.clip(self._used, *_BETWEEN, out=self._used)
-        self.usage[:, : len(_RESOURCES)] = self._used
+        self._usage[:, : len(_RESOURCES)] = self._used
+
+    def usage_of(self, slave: int) -> array[float]:
+        """Return the newest usages of a slave, by slot."""
+        return array("f", self._usage[slave].tobytes())
 
 
 class SimulatedSlave:
@@ -131,9 +135,7 @@ class SimulatedSlave:
         """Return True if the master has accepted its registration."""
         return self.endpoint.link is MasterLink.REGISTERED
 
-    def cycle(
-        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], now: float
-    ) -> None:
+    def cycle(self, usage: array[float], limit: array[float], now: float) -> None:
         """Do a slave's work of one period of `resource_info`."""
         self.endpoint.advance(now)
         accepting = under_limits(usage, limit, _PRESENT, 0)
@@ -266,7 +268,7 @@ class Fleet:
         if index == 0:  # its next cycle comes after one of each other slave
             self._walks.go_on()
         slave = self.slaves[index]
-        slave.cycle(self._walks.usage[index], self._walks.limit, now)
+        slave.cycle(self._walks.usage_of(index), self._walks.limit, now)
         self.tally.cycles += slave.registered
 
     def close(self) -> None:

@@ -19,7 +19,6 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, Final
 
-import numpy as np
 from rclpy.serialization import serialize_message
 
 from rosrm.ros.remembered import remembered
@@ -100,9 +99,6 @@ def _reader(declared: str) -> _Reader:
         return _read_text
     if declared.startswith("sequence<"):
         return _sequence_reader(declared.removeprefix("sequence<").removesuffix(">"))
-    if declared.endswith("]"):
-        inner, _, count = declared.removesuffix("]").partition("[")
-        return _array_reader(_CODES[inner], int(count))
     if declared in _CODES:
         return _number_reader(_CODES[declared])
     return _known(_message_reader(_kind(declared)))
@@ -149,20 +145,6 @@ def _number_reader(code: str) -> _Reader:
         return unpack(content, at)[0], at + size
 
     return read_number
-
-
-def _array_reader(code: str, count: int) -> _Reader:
-    """Return the reader of an array of fixed length."""
-    kind = np.dtype(f"<{code}")
-
-    def read_array(content: bytes, at: int) -> tuple[Any, int]:
-        at += -at % kind.itemsize
-        end = at + count * kind.itemsize
-        if end > len(content):
-            raise _short()
-        return np.frombuffer(content, kind, count, at).copy(), end
-
-    return read_array
 
 
 def _sequence_reader(inner: str) -> _Reader:

@@ -16,11 +16,12 @@ from weakref import WeakKeyDictionary
 
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
+from rosidl_generator_py import import_type_support
 
 from rosrm.errors import Refused
 from rosrm.keys.links import SealedMessage
 from rosrm.keys.roles import may_send
-from rosrm.keys.sealing import FORMAT, channel_of
+from rosrm.keys.sealing import FORMAT, RUN_BYTES, channel_of
 from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
 from rosrm.keys.tickets import Ticket
 from rosrm.ros import cdr, qos
@@ -82,11 +83,14 @@ def envelope_to_msg(envelope: Envelope) -> msg.Sealed:
     )  # fmt: skip
 
 
-def envelope_from_msg(message: msg.Sealed) -> Envelope:
-    """Return the envelope in a ROS message."""
+def envelope_from_msg(message: msg.Sealed) -> Envelope | None:
+    """Return the envelope in a ROS message; None: a run has another length."""
+    run, receiver_run = bytes(message.run), bytes(message.receiver_run)
+    if not len(run) == len(receiver_run) == RUN_BYTES:
+        return None
     return Envelope(
-        message.format, message.principal, message.generation, bytes(message.run),
-        bytes(message.receiver_run), message.counter, bytes(message.body),
+        message.format, message.principal, message.generation, run, receiver_run, message.counter,
+        bytes(message.body),
     )  # fmt: skip
 
 
@@ -166,6 +170,7 @@ class SealedEndpoints(Generic[SecurityT]):
         self.participant = participant
         self.security = security
         self.refused = refused
+        _load_service()
 
     def _open(
         self, channel: bytes, name: str, envelope: Envelope | None
@@ -205,7 +210,7 @@ class SealedEndpoints(Generic[SecurityT]):
         def take(request: srv.Sealed.Request, opened: OpenRequest) -> None:
             envelope = envelope_from_msg(request.message)
             found = self._open(requests, name, envelope)
-            if found is None:
+            if envelope is None or found is None:
                 return
             peer, plain = found
             genuine = SealedRequest(opened, peer, answers, _sealed_part(envelope))
@@ -275,11 +280,13 @@ class SealedEndpoints(Generic[SecurityT]):
         newest: dict[bytes, int] = {}
 
         def check_and_take(message: msg.Signed) -> None:
-            run = bytes(message.run)
+            run, signature = bytes(message.run), bytes(message.signature)
             if message.counter <= newest.get(run, 0):
                 return  # before the signature, whose check takes longer than all else
-            if message.format != FORMAT or not self.security.is_signed(
-                _signed_content(channel, message), bytes(message.signature)
+            if (
+                message.format != FORMAT
+                or (len(run), len(signature)) != (RUN_BYTES, SIGNATURE_BYTES)
+                or not self.security.is_signed(_signed_content(channel, message), signature)
             ):
                 self.refused(name)
                 return
@@ -292,6 +299,18 @@ class SealedEndpoints(Generic[SecurityT]):
         return self.participant.node.create_subscription(
             msg.Signed, name, self.participant.counted(check_and_take), profile
         )
+
+
+def _load_service() -> None:
+    """Load the type of the sealed services without numpy.
+
+    rclpy also loads the type of a service's introspection events, which rosrm does not use. An
+    event contains an array of fixed length, for which the generated Python code imports numpy.
+    """
+    event: Any = type(srv.Sealed.Event)
+    if event._TYPE_SUPPORT is None:  # noqa: SLF001 - rclpy loads the type if it is None
+        types = import_type_support("rosrm_msgs")
+        event._TYPE_SUPPORT = types.type_support_msg__srv__sealed__event  # noqa: SLF001
 
 
 def _is_possible(envelope: Envelope) -> bool:
@@ -396,14 +415,14 @@ class SealedClient:
 
     def complete(self, future: Any, response: srv.Sealed.Response) -> None:
         """Complete a request by an answer, if the answer is genuine."""
-        message = _sealed_part(envelope_from_msg(response.message))
+        envelope = envelope_from_msg(response.message)
         peer, sent = self._sent[future]
-        plain = peer.link.open(self._answers, message, sent.reference)
-        if plain is None:
+        plain = envelope and peer.link.open(self._answers, _sealed_part(envelope), sent.reference)
+        if envelope is None or plain is None:
             self._refused()
             return
         if self.first_contact:
-            peer.run = message.run
+            peer.run = envelope.run
         future.set_result(_plain(self._response_type, plain))
 
     def destroy(self) -> None:

@@ -9,14 +9,16 @@ from __future__ import annotations
 import struct
 from typing import Final, NamedTuple
 
+from rosrm.keys.sealing import RUN_BYTES
+
 #: Encapsulation: little-endian plain CDR, no options.
 _HEADER: Final = b"\x00\x01\x00\x00"
 #: Most letters of a principal. A ticket is the longest, because it contains two names.
 MOST_LETTERS: Final = 512
 #: Format and length of the principal, before its letters.
 _FIRST: Final = struct.Struct("<B3xI")
-#: Generation, run of the sender, run of the receiver.
-_MIDDLE: Final = struct.Struct("<I16s16s")
+#: Generation, then the runs of sender and receiver, each behind its length.
+_MIDDLE: Final = struct.Struct(f"<II{RUN_BYTES}sI{RUN_BYTES}s")
 #: Counter and length of the body.
 _LAST: Final = struct.Struct("<QI")
 
@@ -37,7 +39,9 @@ def encode(envelope: Envelope) -> bytes:
     """Return the CDR form of a message."""
     principal = envelope.principal.encode() + b"\0"
     first = _FIRST.pack(envelope.format, len(principal)) + principal
-    middle = _MIDDLE.pack(envelope.generation, envelope.run, envelope.receiver_run)
+    middle = _MIDDLE.pack(
+        envelope.generation, RUN_BYTES, envelope.run, RUN_BYTES, envelope.receiver_run
+    )
     head = first + _padding(first, 4) + middle
     last = _LAST.pack(envelope.counter, len(envelope.body))
     return b"".join((_HEADER, head, _padding(head, 8), last, envelope.body))
@@ -59,7 +63,9 @@ def decode(data: bytes) -> Envelope | None:
         end = _FIRST.size + letters
         principal = bytes(content[_FIRST.size : end]).rstrip(b"\0").decode()
         end += -end % 4
-        generation, run, receiver_run = _MIDDLE.unpack_from(content, end)
+        generation, run_bytes, run, receiver_bytes, receiver_run = _MIDDLE.unpack_from(content, end)
+        if not run_bytes == receiver_bytes == RUN_BYTES:
+            return None
         end += _MIDDLE.size
         end += -end % 8
         counter, size = _LAST.unpack_from(content, end)

@@ -1,4 +1,4 @@
-"""Sealed readings: `resource_info` in a message of fixed size, which decodes fastest.
+"""Sealed readings: `resource_info` in messages of one size, which decode fastest.
 
 Slave and master write and read the CDR form of `rosrm_msgs/SealedReading` without rclpy. A test
 compares this module with rclpy.
@@ -13,15 +13,15 @@ from typing import Final, NamedTuple
 from rosrm.keys.links import OpenMessage
 from rosrm.keys.sealing import FORMAT, OVERHEAD
 from rosrm.keys.security import Peer
-from rosrm.ros.reading_codec import HOST_ID, LAYOUT
+from rosrm.ros.reading_codec import HOST_ID, READING_BYTES
 from rosrm.ros.sealed_topic import topic_channel
 from rosrm_msgs import msg
 
-#: Encapsulation (little-endian plain CDR, no options), host, format, counter.
-_HEAD: Final = struct.Struct("<4sIIQ")
+#: Encapsulation (little-endian plain CDR, no options), host, format, counter, length of the body.
+_HEAD: Final = struct.Struct("<4sIIQI")
 _CDR: Final = b"\x00\x01\x00\x00"
-_PLAIN_BYTES: Final = LAYOUT.itemsize
-_SIZE: Final = _HEAD.size + _PLAIN_BYTES + OVERHEAD
+_BODY_BYTES: Final = READING_BYTES + OVERHEAD
+_SIZE: Final = _HEAD.size + _BODY_BYTES
 #: Seconds after a registration in which readings of a former run may still arrive.
 _RENEWAL: Final = 5.0
 
@@ -56,7 +56,7 @@ def seal_reading(master: Peer, channel: bytes, reading: bytes) -> bytes:
     """Return a serialised `SealedReading` with a serialised `ResourceInfo`."""
     done = master.link.seal(channel, reading, master.run)
     host = reading[HOST_ID]
-    head = _HEAD.pack(_CDR, int.from_bytes(host, "little"), FORMAT, done.counter)
+    head = _HEAD.pack(_CDR, int.from_bytes(host, "little"), FORMAT, done.counter, _BODY_BYTES)
     return (head + done.body).ljust(_SIZE, b"\0")  # without keys, a body has no tag
 
 
@@ -82,11 +82,11 @@ def open_reading(
     """Return a serialised `ResourceInfo`; None: not genuine, or not of the host that it names."""
     if len(data) != _SIZE:
         return None
-    _, host_id, form, counter = _HEAD.unpack_from(data)
-    slave = slave_of(host_id) if form == FORMAT else None
+    _, host_id, form, counter, length = _HEAD.unpack_from(data)
+    slave = slave_of(host_id) if (form, length) == (FORMAT, _BODY_BYTES) else None
     if slave is None:
         return None
     plain = slave.open(counter, data[_HEAD.size :], master_run)
     if plain is None or plain[HOST_ID] != data[4:8]:
         return None
-    return plain[:_PLAIN_BYTES]
+    return plain[:READING_BYTES]

@@ -9,13 +9,12 @@ import signal
 import socket
 import sys
 import time
+from array import array
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
-
-import numpy as np
 
 from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
@@ -262,8 +261,8 @@ class SlaveRuntime:
         """Return the directory of the snapshots."""
         return self._config.state / "kept"
 
-    def _limits(self) -> np.ndarray[tuple[int, ...], np.dtype[np.float32]]:
-        limit = np.ones(RESOURCE_SLOTS, np.float32)
+    def _limits(self) -> array[float]:
+        limit = array("f", RESOURCE_SLOTS * [1.0])
         for slot, resource in enumerate(self._sampler.resources):
             limit[slot] = self._config.limits.get(resource.name, 1.0)
         return limit

@@ -26,13 +26,11 @@ from __future__ import annotations
 import math
 import threading
 import time
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Final, TypeVar
-
-import numpy as np
-import numpy.typing as npt
 
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.extensions.plugin_calls import with_place
@@ -88,12 +86,12 @@ class Sample:
     """Newest readings of all probes.
 
     Attributes:
-        usage: (RESOURCE_SLOTS,) float32 fractions of the capacity, by slot; 0 where not in use.
+        usage: single-precision fractions of the capacity by slot; 0 where not in use.
         stale: bit i: the reading of slot i is older than its deadline.
         reports: changes since the previous sample.
     """
 
-    usage: npt.NDArray[np.float32]
+    usage: array[float]
     stale: int
     reports: tuple[ProbeReport, ...] = ()
 
@@ -174,7 +172,7 @@ class Sampler:
             if now >= watched.due and not watched.busy:
                 watched.lane.put(watched.prepare(now))
         stale = sum(watched.mask for watched in self._watched if watched.is_stale)
-        return Sample(np.array(self._usage, np.float32), stale, tuple(reports))
+        return Sample(array("f", self._usage), stale, tuple(reports))
 
     def settle(self, timeout: float) -> bool:
         """Wait until no read is running; return False if one still runs after `timeout` seconds."""

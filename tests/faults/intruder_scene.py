@@ -7,14 +7,15 @@ import itertools
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 
 from rosrm.model.orders import FenceInstance, StartInstance, StopInstance
 from rosrm.model.values import (
+    RESOURCE_SLOTS,
     Assignment,
     HostDescription,
     InstanceId,
@@ -25,7 +26,7 @@ from rosrm.model.values import (
 )
 from rosrm.ros import convert, names
 from rosrm.ros.orders import order_to_msg
-from rosrm.ros.reading_codec import LAYOUT, encode
+from rosrm.ros.reading_codec import Reading, encode
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
 from tests.ros.clusters import Cluster, alive, host, job, service
@@ -207,12 +208,11 @@ def registration(name: str) -> srv.RegisterHost.Request:
 
 def reading(**fields: int) -> bytes:
     """Return a reading of a host that is full."""
-    record = np.zeros((), LAYOUT)
-    record["sequence"], record["beat"] = 2**62, time.monotonic_ns()
-    record["present"], record["flags"], record["usage"], record["limit"] = 0b11, 1, 0.99, 1.0
-    for name, value in fields.items():
-        record[name] = value
-    return encode(record)
+    record = Reading(
+        sequence=2**62, beat=time.monotonic_ns(), present=0b11, flags=1,
+        usage=RESOURCE_SLOTS * (0.99,), limit=RESOURCE_SLOTS * (1.0,),
+    )  # fmt: skip
+    return encode(replace(record, **fields))
 
 
 def bytes_below(directory: Path) -> int:

@@ -23,12 +23,11 @@ from rosrm.recording.encoding import encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
 from rosrm.recording.reader import Header, read_record
 from rosrm.ros.master.reading_decoder import decode
-from rosrm.ros.reading_codec import LAYOUT
+from rosrm.ros.reading_codec import Reading
 from rosrm.ros.reading_codec import encode as encode_reading
 from rosrm.snapshots.format import Block, Damaged, checked, decoded, encoded_head
 from rosrm.snapshots.reader import newest, newest_content, newest_head
 from rosrm.supervisor import log_index
-from rosrm.version import PROTOCOL_VERSION
 from rosrm_criu.engine import protobuf, received, relocation
 from rosrm_criu.transfer.archive import Archive, Unpacker
 from rosrm_criu.transfer.receiving import _Stream
@@ -42,9 +41,7 @@ from tests.unit.test_transfer import OFFER, Chunks, tree, zstd
 
 
 def reading() -> bytes:
-    row = np.zeros((), LAYOUT)
-    row["protocol_version"], row["host_id"], row["incarnation"] = PROTOCOL_VERSION, 1, 7
-    return encode_reading(row)
+    return encode_reading(Reading(host_id=1, incarnation=7))
 
 
 @fuzzed(150)

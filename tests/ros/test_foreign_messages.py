@@ -15,13 +15,18 @@ from rosrm.errors import NoMaster
 from rosrm.keys.finding import master_security, user_security
 from rosrm.keys.security import Authority
 from rosrm.keys.tickets import ticket_of
-from rosrm.model.values import HostDescription, ProcessSpec, ResourceDescription
+from rosrm.model.values import (
+    RESOURCE_SLOTS,
+    HostDescription,
+    ProcessSpec,
+    ResourceDescription,
+)
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient
 from rosrm.ros.introductions import introduction_of, introduction_request
 from rosrm.ros.master_connection import MasterClient, find_master, wait_for_service
 from rosrm.ros.participant import Participant
-from rosrm.ros.reading_codec import LAYOUT, encode
+from rosrm.ros.reading_codec import Reading, encode
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.sealed_readings import reading_channel, seal_reading
 from rosrm.testing.local_cluster import claim_domain
@@ -84,16 +89,14 @@ class PlayedHost:
 
     def read(self, **changes: object) -> None:
         """Publish a reading, with some fields changed."""
-        record = np.zeros((), LAYOUT)
-        record["protocol_version"] = PROTOCOL_VERSION
-        record["host_id"], record["incarnation"] = self.number, RUN
-        record["beat"] = time.monotonic_ns()
-        record["present"], record["flags"] = 0b1, 1
-        record["limit"] = 1.0
-        for name, value in changes.items():
-            record[name] = value
+        record = Reading(
+            host_id=self.number, incarnation=RUN, beat=time.monotonic_ns(), present=0b1, flags=1,
+            limit=RESOURCE_SLOTS * (1.0,),
+        )  # fmt: skip
         master = self.slave.endpoints.security.master
-        self._readings.publish(seal_reading(master, self._channel, encode(record)))
+        self._readings.publish(
+            seal_reading(master, self._channel, encode(replace(record, **changes)))
+        )
 
     def leave(self) -> None:
         """Leave the cluster."""

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
-from typing import Final
-
-import numpy as np
-import numpy.typing as npt
 
 from rosrm.core.slave.health import InstanceHealth
 from rosrm.core.slave.watches import (
@@ -22,7 +18,6 @@ from rosrm.core.slave.watches import (
 from rosrm.model.artifacts import Artifact
 from rosrm.model.devices import HeldDevice
 from rosrm.model.values import (
-    RESOURCE_SLOTS,
     Amendment,
     Assignment,
     Component,
@@ -32,8 +27,6 @@ from rosrm.model.values import (
     LifecycleGoal,
     ProcessSpec,
 )
-
-_SLOTS: Final = np.left_shift(np.uint32(1), np.arange(RESOURCE_SLOTS, dtype=np.uint32))
 
 
 @dataclass(slots=True)
@@ -237,17 +230,15 @@ class SlaveState:
         return len(self.alive)
 
 
-def under_limits(
-    usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int, stale: int
-) -> bool:
+def under_limits(usage: Sequence[float], limit: Sequence[float], present: int, stale: int) -> bool:
     """Return True if a host may request work: each limited reading is fresh and under its limit.
 
     Args:
-        usage, limit: (slots,) fractions; limit 1: no limit.
+        usage, limit: fractions by slot; limit 1: no limit.
         present, stale: bit i is slot i.
     """
-    limited = limit < 1.0
-    used = limited & ((present & _SLOTS) != 0)
-    if stale & present and ((stale & _SLOTS) != 0)[used].any():
-        return False
-    return bool((usage < limit)[used].all())
+    return all(
+        used < most and not stale >> slot & 1
+        for slot, (used, most) in enumerate(zip(usage, limit, strict=True))
+        if most < 1.0 and present >> slot & 1
+    )

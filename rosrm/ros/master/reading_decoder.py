@@ -4,13 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.events import ReadingsReceived
-from rosrm.ros.reading_codec import ACCEPTING, LAYOUT, QUIET_SHIFT
+from rosrm.model.values import RESOURCE_SLOTS
+from rosrm.ros.reading_codec import ACCEPTING, QUIET_SHIFT
 from rosrm.version import PROTOCOL_VERSION
+
+#: Form of a message. The numbers of usages and of limits are `RESOURCE_SLOTS`.
+LAYOUT: Final = np.dtype(
+    [
+        ("header", "S4"),
+        ("protocol_version", "<u2"), ("flags", "<u2"), ("host_id", "<u4"),
+        ("incarnation", "<u8"), ("sequence", "<u8"), ("beat", "<u8"), ("master_beat", "<u8"),
+        ("status_sequence", "<u8"),
+        ("processes", "<u4"), ("present", "<u4"), ("stale", "<u4"),
+        ("usages", "<u4"), ("usage", "<f4", (RESOURCE_SLOTS,)),
+        ("limits", "<u4"), ("limit", "<f4", (RESOURCE_SLOTS,)),
+    ]
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,12 +70,13 @@ def decode(messages: Sequence[bytes]) -> Decoded:
     Messages of another size, byte order or protocol version are refused, never misread.
     """
     fit = [raw for raw in messages if len(raw) == LAYOUT.itemsize and raw[1] == 1]
-    refusals = []
-    if len(fit) < len(messages):
-        refusals.append("a resource_info of another size than ours: another version of rosrm?")
-    if not fit:
-        return Decoded(refusals=tuple(refusals))
     rows = np.frombuffer(b"".join(fit), LAYOUT)
+    rows = rows[(rows["usages"] == RESOURCE_SLOTS) & (rows["limits"] == RESOURCE_SLOTS)]
+    refusals = []
+    if len(rows) < len(messages):
+        refusals.append("a resource_info of another size than ours: another version of rosrm?")
+    if not len(rows):
+        return Decoded(refusals=tuple(refusals))
     ours = rows["protocol_version"] == PROTOCOL_VERSION
     if not ours.all():
         refusals += [

@@ -5,13 +5,12 @@ from __future__ import annotations
 import logging
 import math
 import time
+from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import Enum
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
 from rclpy.duration import Duration
 
 from rosrm.core.slave import events
@@ -421,10 +420,10 @@ class SlaveEndpoint:
     # --- reports ---------------------------------------------------------------------------
 
     def publish_reading(
-        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], present: int,
-        stale: int, *, accepting: bool, processes: int,
+        self, usage: array[float], limit: array[float], present: int, stale: int, *,
+        accepting: bool, processes: int,
     ) -> None:  # fmt: skip
-        """Publish utilisation and limits of this host, (slots,) fractions, once in every cycle.
+        """Publish utilisation and limits of this host, fractions by slot, once in every cycle.
 
         A reading without news is sent with a later cycle (`rosrm.ros.slave.reporter`).
         """

@@ -9,14 +9,11 @@ message, after at most one beat period of the master, so both sides hear from ea
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from array import array
+from collections.abc import Callable, Sequence
 from typing import Final
 
-import numpy as np
-import numpy.typing as npt
-
-from rosrm.ros.reading_codec import LAYOUT, MOST_QUIET, encode, flags
-from rosrm.version import PROTOCOL_VERSION
+from rosrm.ros.reading_codec import MOST_QUIET, Reading, encode, flags
 
 #: Part of a resource's capacity by which a usage must have moved to be published at once.
 RESOLUTION: Final = 0.01
@@ -38,58 +35,54 @@ class Reporter:
         self._period = period
         self._every = 1
         self._unpublished = 0
-        self._row = np.zeros((), LAYOUT)
-        self._row["protocol_version"] = PROTOCOL_VERSION
-        self._row["incarnation"] = incarnation
+        self._reading = Reading(incarnation=incarnation)
         self._facts: _Facts = (False, 0, 0, 0, 0)
         self._published: _Facts | None = None
-        self._published_usage = self._published_limit = np.zeros(0, np.float32)
-        self._published_over = np.zeros(0, np.bool_)
+        self._published_usage: Sequence[float] = ()
+        self._published_limit: Sequence[float] = ()
 
     def begin(self, host_id: int, beat_period: float) -> None:
         """Start reporting to a master that accepted this host; the next reading is always sent."""
-        self._row["host_id"] = host_id
+        self._reading.host_id = host_id
         # The summand rounds up, because three periods of 0.1 s are slightly less than 0.3 s.
         self._every = min(max(1, int(beat_period / self._period + 1e-6)), MOST_QUIET + 1)
         self._published = None
 
     def note_master(self, beat: int) -> None:
         """Store the newest received beat of the master, ns, for the next reading."""
-        self._row["master_beat"] = beat
+        self._reading.master_beat = beat
 
-    def cycle(
-        self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32], facts: _Facts
-    ) -> None:
-        """Enter one cycle of the slave; send its reading if that brings news or is due."""
-        row = self._row
-        row["sequence"] += 1
-        row["usage"], row["limit"] = usage, limit
+    def cycle(self, usage: array[float], limit: array[float], facts: _Facts) -> None:
+        """Enter one cycle of the slave; send its reading if that brings news or is due.
+
+        Args:
+            usage, limit: single-precision fractions by slot.
+        """
+        self._reading.sequence += 1
+        self._reading.usage, self._reading.limit = usage, limit
         self._facts = facts
         self._unpublished += 1
         if self._unpublished >= self._every or self._has_news(usage, limit):
             self.publish()
 
-    def _has_news(self, usage: npt.NDArray[np.float32], limit: npt.NDArray[np.float32]) -> bool:
+    def _has_news(self, usage: array[float], limit: array[float]) -> bool:
         """Return True if a decision may differ between this reading and the last published one."""
-        if self._facts != self._published:
+        if self._facts != self._published or limit != self._published_limit:
             return True
-        return bool(
-            (np.abs(usage - self._published_usage) >= RESOLUTION).any()
-            or ((usage >= limit) != self._published_over).any()
-            or (limit != self._published_limit).any()
+        return any(
+            abs(now - before) >= RESOLUTION or (now >= most) != (before >= most)
+            for now, before, most in zip(usage, self._published_usage, limit, strict=True)
         )
 
     def publish(self) -> None:
         """Send the newest reading, unless it has been sent."""
         if not self._unpublished:
             return
-        row = self._row
-        accepting, row["processes"], row["present"], row["stale"], statuses = self._facts
-        row["status_sequence"] = statuses
-        row["flags"] = flags(accepting=accepting, quiet=self._unpublished - 1)
-        row["beat"] = time.monotonic_ns()
+        one = self._reading
+        accepting, one.processes, one.present, one.stale, one.status_sequence = self._facts
+        one.flags = flags(accepting=accepting, quiet=self._unpublished - 1)
+        one.beat = time.monotonic_ns()
         self._unpublished = 0
         self._published = self._facts
-        self._published_usage, self._published_limit = row["usage"].copy(), row["limit"].copy()
-        self._published_over = self._published_usage >= self._published_limit
-        self._send(encode(row))
+        self._published_usage, self._published_limit = one.usage, one.limit
+        self._send(encode(one))

@@ -151,8 +151,10 @@ Bytes encoded(const Sealed & sealed)
   out.number(sealed.format);
   out.text(sealed.principal);
   out.number(sealed.generation);
-  out.raw(sealed.run.data(), sealed.run.size());
-  out.raw(sealed.receiver_run.data(), sealed.receiver_run.size());
+  for (const auto & run : {sealed.run, sealed.receiver_run}) {
+    out.number(static_cast<std::uint32_t>(run.size()));
+    out.raw(run.data(), run.size());
+  }
   out.number(sealed.counter);
   out.blob(sealed.body);
   return out.take();
@@ -168,8 +170,12 @@ Sealed decoded_sealed(const Bytes & data)
     throw Malformed("its principal is too long");
   }
   sealed.generation = in.number<std::uint32_t>();
-  in.raw(sealed.run);
-  in.raw(sealed.receiver_run);
+  for (Run * run : {&sealed.run, &sealed.receiver_run}) {
+    if (in.number<std::uint32_t>() != kRunBytes) {
+      throw Malformed("a run has another length");
+    }
+    in.raw(*run);
+  }
   sealed.counter = in.number<std::uint64_t>();
   sealed.body = in.blob();
   return sealed;

@@ -31,6 +31,7 @@ text = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=9
 u8, u32, u64 = (st.integers(0, 2**bits - 1) for bits in (8, 32, 64))
 stamps = st.lists(st.integers(-(2**63), 2**63 - 1), max_size=4).map(lambda one: array("q", one))
 data = st.binary(max_size=9).map(lambda one: array("B", one))
+runs = st.binary(min_size=16, max_size=16).map(lambda one: array("B", one))
 phase = st.integers(0, 255)
 
 
@@ -57,7 +58,7 @@ MESSAGES = {
     ),
     3: st.builds(
         Sealed, format=u8, principal=text, generation=u32, counter=u64, body=data,
-        run=st.lists(u8, min_size=16, max_size=16),
+        run=runs, receiver_run=runs,
     ),
 }  # fmt: skip
 cases = st.integers(0, 3).flatmap(lambda kind: st.tuples(st.just(kind), MESSAGES[kind]))
@@ -105,6 +106,13 @@ def test_an_envelope_of_the_own_codec_is_read(core):
     assert again is not None
     assert deserialize_message(again, Sealed).counter == 7
     assert again == envelope
+
+
+@pytest.mark.parametrize(("run", "receiver_run"), [(0, 16), (15, 17), (17, 15), (16, 0)])
+def test_an_envelope_with_a_run_of_another_length_is_malformed(core, run, receiver_run):
+    """Otherwise a run would have bytes of the next field."""
+    sent = Sealed(run=array("B", bytes(run)), receiver_run=array("B", bytes(receiver_run)))
+    assert rewritten(core, 3, serialize_message(sent)) is None
 
 
 def newest(core, directory, up_to=9) -> str:

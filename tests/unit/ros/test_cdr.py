@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
@@ -43,10 +42,6 @@ def value_of(declared: str, chance: random.Random) -> Any:
         inner = declared.removeprefix("sequence<").removesuffix(">")
         found = [value_of(inner, chance) for _ in range(chance.choice((0, 0, 1, 2, 5)))]
         return array(_NUMBERS[inner], found) if inner in _NUMBERS else found
-    if declared.endswith("]"):
-        inner, _, count = declared.removesuffix("]").partition("[")
-        numbers = [value_of(inner, chance) for _ in range(int(count))]
-        return np.array(numbers, np.dtype(_NUMBERS[inner]))
     if declared == "string":
         return "".join(chance.choice("ab/~é€") for _ in range(chance.choice((0, 1, 3, 4, 9))))
     if declared == "boolean":

@@ -2,34 +2,38 @@
 
 from __future__ import annotations
 
+from array import array
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.model.values import RESOURCE_SLOTS
-from rosrm.ros.master.reading_decoder import decode
-from rosrm.ros.reading_codec import ACCEPTING, LAYOUT, MOST_QUIET, encode, flags
+from rosrm.ros.master.reading_decoder import LAYOUT, decode
+from rosrm.ros.reading_codec import (
+    ACCEPTING,
+    MOST_QUIET,
+    READING_BYTES,
+    Reading,
+    encode,
+    flags,
+)
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
 
 NUMBERS = {
     "protocol_version": PROTOCOL_VERSION, "flags": ACCEPTING, "host_id": 0xFEDCBA98,
     "incarnation": 0xFEDCBA9876543210, "sequence": 3, "beat": 2**63 + 5, "master_beat": 6,
-    "status_sequence": 2**40, "processes": 8, "present": 0xFFFF, "stale": 0b101, "reserved": 0,
+    "status_sequence": 2**40, "processes": 8, "present": 0xFFFF, "stale": 0b101,
 }  # fmt: skip
-USAGE = np.linspace(0.0, 1.5, RESOURCE_SLOTS, dtype=np.float32)
-LIMIT = np.linspace(1.0, 0.1, RESOURCE_SLOTS, dtype=np.float32)
+USAGE = array("f", np.linspace(0.0, 1.5, RESOURCE_SLOTS))
+LIMIT = array("f", np.linspace(1.0, 0.1, RESOURCE_SLOTS))
+READING = Reading(**NUMBERS, usage=USAGE, limit=LIMIT)
 
 
 def info(**changes) -> msg.ResourceInfo:
     return msg.ResourceInfo(**{**NUMBERS, "usage": USAGE, "limit": LIMIT, **changes})
-
-
-def row(**changes) -> np.ndarray:
-    record = np.zeros((), LAYOUT)
-    for name, value in {**NUMBERS, "usage": USAGE, "limit": LIMIT, **changes}.items():
-        record[name] = value
-    return record
 
 
 def beats(decoded) -> dict:
@@ -41,25 +45,26 @@ def beats(decoded) -> dict:
 
 def test_encoding_is_what_rclpy_writes() -> None:
     """A reader in any language receives the message that rclpy would have sent."""
-    assert encode(row()) == serialize_message(info())
+    assert encode(READING) == serialize_message(info())
 
 
 def test_every_byte_is_a_field() -> None:
-    """Each field of the layout is where rclpy reads the field of that name."""
-    for name in LAYOUT.names[1:]:
-        record = row()
-        record[name] = 0
-        message = deserialize_message(encode(record), msg.ResourceInfo)
-        for other, value in {**NUMBERS, "usage": USAGE, "limit": LIMIT}.items():
-            expected = np.zeros_like(value) if other == name else value
-            np.testing.assert_array_equal(getattr(message, other), expected, err_msg=other)
+    """Each field is where rclpy reads the field of that name."""
+    nothing = array("f", RESOURCE_SLOTS * [0.0])
+    for field in fields(Reading):
+        zero = 0 if field.name in NUMBERS else nothing
+        expected = replace(READING, **{field.name: zero})
+        message = deserialize_message(encode(expected), msg.ResourceInfo)
+        for name in message.get_fields_and_field_types():
+            assert getattr(message, name) == getattr(expected, name), name
 
 
-def test_zeros_at_the_end_are_kept() -> None:
-    """The header's last two bytes are zero, and so may be all others."""
-    raw = encode(np.zeros((), LAYOUT))
-    assert raw[:4] == b"\0\1\0\0"
-    assert len(raw) == LAYOUT.itemsize == len(serialize_message(msg.ResourceInfo()))
+def test_the_decoder_has_the_same_fields() -> None:
+    """Its arrays are where the encoder writes the fields of the same names."""
+    assert LAYOUT.itemsize == READING_BYTES == len(encode(READING))
+    row = np.frombuffer(encode(READING), LAYOUT)[0]
+    for field in fields(Reading):
+        np.testing.assert_array_equal(row[field.name], getattr(READING, field.name))
 
 
 def test_decoding_what_rclpy_writes() -> None:
@@ -133,9 +138,10 @@ def test_a_former_run_hides_no_reading() -> None:
         (serialize_message(info())[:-1], "another size"),
         (serialize_message(info()) + b"\0", "another size"),
         (b"\0\0" + serialize_message(info())[2:], "another size"),
+        (serialize_message(info(usage=USAGE[1:], limit=array("f", [0.0, *LIMIT]))), "another size"),
         (b"", "another size"),
     ],
-    ids=["version", "short", "long", "big-endian", "empty"],
+    ids=["version", "short", "long", "big-endian", "other numbers of slots", "empty"],
 )
 def test_strangers_are_refused(raw, said) -> None:
     """Another version, size or byte order is refused with a message, and not decoded."""

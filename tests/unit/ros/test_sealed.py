@@ -13,7 +13,8 @@ from rosrm.errors import Refused
 from rosrm.keys.cluster import ClusterSecret, own_grant
 from rosrm.keys.links import SealedMessage
 from rosrm.keys.roles import Principal
-from rosrm.keys.security import Member, MemberSecurity, NoSecurity, Peer
+from rosrm.keys.sealing import RUN_BYTES
+from rosrm.keys.security import SIGNATURE_BYTES, Member, MemberSecurity, NoSecurity, Peer
 from rosrm.keys.tickets import Ticket
 from rosrm.ros import qos
 from rosrm.ros.callback_guard import CallbackGuard
@@ -29,6 +30,7 @@ from rosrm.ros.sealed import (
 from rosrm_msgs import msg, srv
 
 SUBMIT, BEATS = "/rosrm/submit", "/rosrm/master_beat"
+RUN = array("B", bytes(RUN_BYTES))
 
 
 class Service:
@@ -122,13 +124,24 @@ def test_a_request_beyond_its_bounds_is_answered_with_the_field() -> None:
         {"principal": f"ticket:1:read_log:{600 * 'p'}:user:a"},
         {"format": 2},
         {"principal": "nobody"},
+        {"run": array("B", bytes(15))},
+        {"receiver_run": array("B", bytes(17))},
     ],
-    ids=["huge", "long name", "long ticket", "other format", "no principal"],
+    ids=[
+        "huge",
+        "long name",
+        "long ticket",
+        "other format",
+        "no principal",
+        "short run",
+        "long run",
+    ],
 )
 def test_a_message_of_no_principal_is_counted_and_not_answered(fields) -> None:
     """The executor gets no exception: that would end the master."""
     service = Service(srv.Submit, SUBMIT, lambda *_: pytest.fail("it was handled"))
-    service.take(msg.Sealed(**{"format": 1, "principal": "", **fields}))
+    whole = {"format": 1, "principal": "", "run": RUN, "receiver_run": RUN}
+    service.take(msg.Sealed(**{**whole, **fields}))
     assert service.refused == [SUBMIT]
     assert service.sent == []
 
@@ -180,7 +193,20 @@ class Follower:
     def beat(self, run: int, counter: int) -> None:
         body = array("B", serialize_message(msg.MasterBeat(beat=counter)))
         sender = array("B", run.to_bytes(16, "big"))
-        self.take(msg.Signed(format=1, run=sender, counter=counter, body=body))
+        signature = array("B", bytes(SIGNATURE_BYTES))
+        self.take(msg.Signed(format=1, run=sender, counter=counter, signature=signature, body=body))
+
+
+@pytest.mark.parametrize("field", ["run", "signature"])
+def test_a_beat_with_a_field_of_another_length_is_dropped(field: str) -> None:
+    """A signature covers the bytes of run and body, and not where one ends."""
+    follower, whole = Follower(), {"run": RUN, "signature": array("B", bytes(SIGNATURE_BYTES))}
+    body = array("B", serialize_message(msg.MasterBeat(beat=1)))
+    for number, length in enumerate((0, 1, len(whole[field]) - 1, len(whole[field]) + 1), 1):
+        changed = {**whole, field: array("B", bytes(length))}
+        follower.take(msg.Signed(format=1, counter=number, body=body, **changed))
+    assert follower.checked == 0
+    assert follower.taken == []
 
 
 def test_a_repeated_beat_is_dropped_before_its_signature_is_checked() -> None:

@@ -41,6 +41,13 @@ def test_a_message_that_ends_early_or_claims_too_much_is_malformed() -> None:
     assert decode(encode(envelope("p" * 1000))) is None
 
 
+@pytest.mark.parametrize(("run", "receiver_run"), [(0, 16), (15, 17), (17, 15), (16, 0)])
+def test_a_message_with_a_run_of_another_length_is_malformed(run: int, receiver_run: int) -> None:
+    """Otherwise a run would have bytes of the next field."""
+    message = msg.Sealed(run=array("B", bytes(run)), receiver_run=array("B", bytes(receiver_run)))
+    assert decode(serialize_message(message)) is None
+
+
 @given(st.binary(max_size=200))
 def test_any_bytes_can_be_decoded(data: bytes) -> None:
     """A stranger can send anything; nothing raises."""

@@ -10,6 +10,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosrm.keys.cluster import ClusterSecret, own_grant
 from rosrm.keys.roles import Principal
 from rosrm.keys.security import MasterSecurity, MemberSecurity, NoSecurity
+from rosrm.ros.reading_codec import Reading, encode
 from rosrm.ros.sealed_readings import (
     RegisteredSlave,
     may_be_of_former_run,
@@ -24,11 +25,11 @@ HOST_ID = 7
 CHANNEL = reading_channel("/rosrm/resource_info")
 SECRET = ClusterSecret(bytes(range(32)))
 #: Where a message has its parts.
-FORMAT, COUNTER, BODY = slice(8, 12), slice(12, 20), 20
+FORMAT, COUNTER, LENGTH, BODY = slice(8, 12), slice(12, 20), slice(20, 24), 24
 
 
 def reading(host_id: int = HOST_ID) -> bytes:
-    return serialize_message(msg.ResourceInfo(protocol_version=1, host_id=host_id, sequence=5))
+    return encode(Reading(host_id=host_id, sequence=5))
 
 
 class Sides:
@@ -98,7 +99,7 @@ def test_the_master_opens_the_form_of_rclpy(sides) -> None:
     assert sides.opened(serialize_message(message)) == reading()
 
 
-@pytest.mark.parametrize("cut", [0, 1, 4, 19, 20, 231])
+@pytest.mark.parametrize("cut", [0, 1, 4, 23, 24, 239])
 def test_a_message_of_another_size_does_not_open(sides, cut: int) -> None:
     data = sides.sealed()
     assert sides.opened(data[:cut]) is None
@@ -108,6 +109,12 @@ def test_a_message_of_another_size_does_not_open(sides, cut: int) -> None:
 
 def test_a_message_of_another_format_does_not_open(sides) -> None:
     assert sides.opened(changed(sides.sealed(), FORMAT, 2)) is None
+
+
+def test_a_message_whose_body_has_another_length_does_not_open(sides) -> None:
+    data = sides.sealed()
+    assert sides.opened(changed(data, LENGTH, len(data) - BODY - 1)) is None
+    assert sides.opened(data) == reading()
 
 
 def test_a_message_of_an_unknown_host_does_not_open(sides) -> None:
@@ -132,7 +139,7 @@ def test_a_slave_does_not_open_as_another_host(keyed) -> None:
     assert keyed.opened(changed(keyed.sealed(), slice(4, 8), 8)) is None
 
 
-@pytest.mark.parametrize("at", [COUNTER.start, BODY, BODY + 100, 231])
+@pytest.mark.parametrize("at", [COUNTER.start, BODY, BODY + 100, 239])
 def test_a_changed_message_does_not_open(keyed, at: int) -> None:
     """The first header is not covered; nothing depends on it."""
     data = keyed.sealed()

@@ -413,5 +413,5 @@ def test_no_probes():
     """A host without probes has an empty sample."""
     sampler = Sampler([])
     sample = sampler.first(PATIENCE)
-    assert (sample.stale, sampler.present, float(sample.usage.sum())) == (0, 0, 0.0)
+    assert (sample.stale, sampler.present, sum(sample.usage)) == (0, 0, 0.0)
     assert sampler.close() == ()

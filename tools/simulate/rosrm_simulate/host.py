@@ -7,6 +7,7 @@ subclasses add the usage of the programs, delays and faults.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from array import array
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -214,7 +215,7 @@ class Host(ABC, Generic[ProgramT]):
         usage[:count] = [used[one.name] for one in self.resources]
         stale = sum((one.name in self.stale) << slot for slot, one in enumerate(self.resources))
         accepts = under_limits(
-            usage.astype(np.float32), self.limit.astype(np.float32), (1 << count) - 1, stale
+            array("f", usage.tolist()), array("f", self.limit.tolist()), (1 << count) - 1, stale
         )
         return SimulatedReading(now, usage, stale, accepts)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -33,7 +35,7 @@ class Slave:
     def cycle(self, facts=FACTS) -> int:
         """Run one cycle and return the number of messages sent in it."""
         before = len(self.sent)
-        self.reporter.cycle(self.usage, self.limit, facts)
+        self.reporter.cycle(array("f", self.usage), array("f", self.limit), facts)
         return len(self.sent) - before
 
 
