@@ -23,7 +23,7 @@ from rosrm.runtime import cgroups
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
-from rosrm.wording import size
+from rosrm.wording import counted, size
 
 #: Most walks over the processes of a group of version 1, which may fork.
 _WALKS: Final = 20
@@ -52,6 +52,7 @@ class InstanceGroups:
         self._unset: dict[Key, dict[str, Any]] = {}  # limits that could not be set at the start
         self._kills_before: dict[Key, int] = {}
         self._emptied: dict[str, float] = {}
+        self._unfinished: dict[Key, set[Tree]] = {}  # groups that some processes did not enter
 
     def find_again(self, live: Mapping[Key, int]) -> None:
         """Find the groups of instances of an earlier supervisor; kill and remove all others.
@@ -113,7 +114,7 @@ class InstanceGroups:
     def add(self, key: Key, limits: LimitRule) -> None:
         """Make the groups that a running instance lacks for new limits; move its processes there.
 
-        A limit without its group is in `lacking`.
+        A limit without its group, or whose group lacks a process, is in `lacking`.
         """
         made = self._made.get(key, ())
         for tree in self.trees:
@@ -121,10 +122,24 @@ class InstanceGroups:
             if made and tree not in made and needs:
                 path = _path(tree, key)
                 self._emptied.pop(path, None)  # otherwise the moved processes would be killed
-                with contextlib.suppress(OSError):
+                try:
                     _make(path, tree)
                     _move_all(_path(made[0], key), path)
+                except OSError as error:
+                    own_log.write(f"the control group {path} cannot be used: {error.strerror}")
+                    self._undo(key, tree)
+                else:
                     self._made[key] = (*self._made[key], tree)
+
+    def _undo(self, key: Key, tree: Tree) -> None:
+        """Move the processes out of a group that others did not enter, and remove the group."""
+        path = _path(tree, key)
+        for pid in pids(path):
+            with contextlib.suppress(OSError):
+                cgroups.write(os.path.join(tree.home, "cgroup.procs"), str(pid))
+        remove_empty(path)
+        if os.path.isdir(path):  # a process has forked during the loop
+            self._unfinished.setdefault(key, set()).add(tree)
 
     def lacking(self, key: Key, limits: LimitRule) -> dict[str, str]:
         """Return the limits for which an instance has no group, with the reasons."""
@@ -207,7 +222,7 @@ class InstanceGroups:
         """Remove the group of an instance that has ended, with all that may be left in it."""
         self._kills_before.pop(key, None)
         self._unset.pop(key, None)
-        for tree in self._made.pop(key, ()):
+        for tree in (*self._made.pop(key, ()), *self._unfinished.pop(key, ())):
             self._end(_path(tree, key), now)
 
     def look(self, now: float) -> None:
@@ -388,7 +403,7 @@ def _move_all(source: str, target: str) -> None:
     """Move the processes of a group of version 1 to another hierarchy, with those that they fork.
 
     Raises:
-        OSError: a process cannot be moved.
+        OSError: a process cannot be moved, or they fork faster than they are moved.
     """
     for _ in range(_WALKS):
         left = set(pids(source)).difference(pids(target))
@@ -397,6 +412,7 @@ def _move_all(source: str, target: str) -> None:
                 cgroups.write(os.path.join(target, "cgroup.procs"), str(pid))
         if not left:
             return
+    raise OSError(errno.EAGAIN, f"{counted(len(left), 'process', 'processes')} outside of it")
 
 
 def _enter(path: str) -> None:

@@ -168,6 +168,39 @@ def test_a_group_added_to_a_running_instance_waits_for_no_removal(tmp_path: Path
     assert groups.lacking(KEY, limits) == {}
 
 
+@pytest.fixture
+def unmoved(tmp_path: Path) -> InstanceGroups:
+    """Return the groups of an instance with two processes, which only memory limits so far."""
+    (tmp_path / "cgroup.procs").touch()
+    trees = [Tree(1, str(tmp_path / name), str(tmp_path), (name,)) for name in ("memory", "cpu")]
+    groups = InstanceGroups(trees)
+    for tree in trees:
+        Path(tree.top).mkdir()
+    groups.make(KEY, LimitRule(), realtime=False)
+    (tmp_path / "memory" / "camera.1" / "cgroup.procs").write_text(f"{2**22 + 1} {2**22 + 2}")
+    return groups
+
+
+def test_a_group_that_no_process_can_be_moved_to_is_removed(unmoved, tmp_path: Path) -> None:
+    """The limit is reported as not enforced, and no empty group stays."""
+    limits = LimitRule(cpu=1.0)
+    unmoved.add(KEY, limits)  # the new directory has no file cgroup.procs
+    assert unmoved.lacking(KEY, limits).keys() == {"limits.cpu"}
+    assert not (tmp_path / "cpu" / "camera.1").exists()
+
+
+def test_a_limit_of_only_some_processes_is_not_enforced(unmoved, tmp_path: Path) -> None:
+    """A group that lacks a process after the last walk is removed with its instance."""
+    group, limits = tmp_path / "cpu" / "camera.1", LimitRule(cpu=1.0)
+    group.mkdir()
+    (group / "cgroup.procs").touch()  # a plain file: has only the process moved last
+    unmoved.add(KEY, limits)
+    assert unmoved.lacking(KEY, limits).keys() == {"limits.cpu"}
+    (group / "cgroup.procs").unlink()
+    unmoved.remove(KEY, 0.0)
+    assert not group.exists()
+
+
 class Closed(InstanceGroups):
     """Groups that can be made, and that no process can enter."""
 
