@@ -33,13 +33,14 @@ class _Segment(NamedTuple):
     end: int
 
 
-def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
+def read_log(state_directory: Path, query: LogQuery, *, ended: bool, pid: int = 0) -> LogPart:
     """Read a part of an instance's output; raises `Refused` if this host has no log of it.
 
     Args:
         state_directory: of the supervisor.
         query: with the number of the instance.
         ended: the instance has ended.
+        pid: of its process; 0: unknown.
     """
     instance = InstanceId(query.process, query.number)
     path = log_path(state_directory, instance)
@@ -51,7 +52,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool) -> LogPart:
     for _ in range(_TRIES):
         try:
             before = log_index.base(str(path))
-            part = _read(path, _segments(path), query, numbers, ended=ended)
+            part = _read(path, _segments(path), query, numbers, ended=ended, pid=pid)
             after = log_index.base(str(path))
         except FileNotFoundError:
             if not path.exists():
@@ -103,7 +104,7 @@ def _segments(path: Path) -> list[_Segment]:
 
 def _read(
     path: Path, segments: Sequence[_Segment], query: LogQuery, numbers: Sequence[int], *,
-    ended: bool,
+    ended: bool, pid: int,
 ) -> LogPart:  # fmt: skip
     last = segments[-1].end
     offset = min(_start(segments, query), last)
@@ -113,7 +114,7 @@ def _read(
     with found.path.open("rb") as log:
         log.seek(offset - found.begin)
         content = log.read(min(query.max_bytes or _MOST, _MOST))
-    marks, end = _marks(found, offset, offset + len(content), now=found.path == path)
+    marks, end = _marks(found, offset, offset + len(content), now=found.path == path, pid=pid)
     content = content[: end - offset]
     return LogPart(query.number, numbers, content, offset, end, ended and end >= last, marks)
 
@@ -176,16 +177,20 @@ def _written_since(segments: Sequence[_Segment], since: float) -> int:
 
 
 def _marks(
-    segment: _Segment, begin: int, end: int, *, now: bool
+    segment: _Segment, begin: int, end: int, *, now: bool, pid: int
 ) -> tuple[list[tuple[float, int, int]], int]:
     """Return the marks of a part, including one after its end, and the end of the part.
 
-    With `now` the file is still written, and bytes without a mark count as written now.
+    With `now` the file is still written, and bytes without a mark count as written now. The
+    supervisor makes the index a moment after the first output; until then the time of the newest
+    output counts as that of the start.
     """
     with log_index.Index(str(segment.path)) as index:
         first = index.find(lambda mark: mark.offset >= begin)
         last = index.find(lambda mark: mark.offset >= end)
         found = index.marks(first, min(last + 1 - first, _MOST_MARKS))
+        if pid and not index.count and begin == 0:
+            found = [log_index.Mark(segment.path.stat().st_mtime, 0, pid)]
     if len(found) == _MOST_MARKS:
         return list(found), min(end, found[-1].offset)
     if now and (not found or found[-1].offset < end):

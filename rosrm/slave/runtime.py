@@ -595,7 +595,8 @@ class SlaveRuntime:
         held = self._state.held.get(InstanceId(query.process, query.number))
         ended = held is None or held.status.state.ended
         try:
-            return read_log(self._supervisor.state, query, ended=ended)
+            pid = 0 if held is None else held.status.pid
+            return read_log(self._supervisor.state, query, ended=ended, pid=pid)
         except Refused:
             if ended:
                 raise

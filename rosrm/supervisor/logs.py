@@ -4,7 +4,7 @@ A process holds its log open for appending. So the supervisor copies a full log 
 it; output between the copy and the truncation is lost. A flooding process can exceed the bound by
 its output of one interval. Dropped output shows in the offsets of the index beside each file
 (`log_index`). The index also holds the time of output: each check that finds a log grown adds a
-record.
+record. The first one that does so makes the index: a program without output needs none.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class LogKeeper:
         log = self._logs[instance] = _Log(paths.log_file(self._state, *instance))
         opened = self._opened.pop(instance, 0)
         if started:
-            log.note(opened, started)
+            log.begin(opened, started)
         self._due = now + BUSY
 
     def release(self, instance: Key) -> None:
@@ -166,6 +166,14 @@ class _Log:
             self.base = index.mark(0).offset if index.count else 0
             self.size = index.mark(index.count - 1).offset - self.base if index.count else 0
             self._has_index = index.count > 0
+        self._start: Mark | None = None  # of the program, which has no output and no index yet
+
+    def begin(self, size: int, pid: int) -> None:
+        """Record the start of a program at the end of the log file, which has `size` bytes."""
+        if size or self._has_index:
+            self.note(size, pid)
+        else:
+            self._start = Mark(time.time(), self.base, pid)
 
     def look(self, limits: LogLimits) -> int:
         """Record growth in the index, and rotate a log over its limits; return the new bytes."""
@@ -194,7 +202,10 @@ class _Log:
             self._has_index = False
         self.size = size
         try:
-            if not self._has_index and self.base + size > 0:
+            if self._start is not None:
+                log_index.add(self.path, self._start)
+                self._start = None
+            elif not self._has_index and self.base + size > 0:
                 log_index.begin(self.path, Mark(now, self.base, 0))
             log_index.add(self.path, Mark(now, self.base + size, pid))
             self._has_index = True

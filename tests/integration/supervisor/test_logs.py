@@ -68,11 +68,11 @@ def test_the_index_of_logs_survives_the_supervisor(host):
     """A new supervisor knows the existing logs, and prunes them, too."""
     client = host.connect(log=LogLimits(instances=2))
     for number in range(1, 3):
-        host.run(client, host.order("many", "true", number=number))
+        host.run(client, host.order("many", "echo", "output", number=number))
         client.send(Forget((StatusStored(("many", number)),)))
     host.kill_supervisor(client)
     client = host.connect(log=LogLimits(instances=2))
-    host.run(client, host.order("many", "true", number=3))
+    host.run(client, host.order("many", "echo", "output", number=3))
     assert sorted(file.name for file in host.log("many").parent.iterdir()) == [
         "many.2.log", "many.2.log.times", "many.3.log", "many.3.log.times",
     ]  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+import time
 
 import hypothesis.strategies as st
 import pytest
@@ -31,9 +32,9 @@ def log(tmp_path):
     return path
 
 
-def read(tmp_path, offset=0, most=0, *, ended=False, **more):
+def read(tmp_path, offset=0, most=0, *, ended=False, pid=0, **more):
     query = LogQuery(P.process, P.number, offset, max_bytes=most, **more)
-    return read_log(tmp_path, query, ended=ended)
+    return read_log(tmp_path, query, ended=ended, pid=pid)
 
 
 def everything(tmp_path, **more):
@@ -278,6 +279,24 @@ def test_starts_and_growth_are_noted(tmp_path, keeper) -> None:
     keeper.release((P.process, P.number))
     marks = read(tmp_path, ended=True).marks
     assert [mark[1:] for mark in marks] == [(0, 7), (6, 0), (6, 8), (12, 0)]
+
+
+def test_a_program_without_output_needs_no_index(tmp_path, keeper) -> None:
+    """Most files that a short job would leave are not made."""
+    start(keeper, 7)
+    keeper.look(1e9)
+    keeper.release((P.process, P.number))
+    assert [file.name for file in log_path(tmp_path, P).parent.iterdir()] == ["robot%2Fp.3.log"]
+
+
+def test_a_start_is_known_before_the_first_look(tmp_path, keeper) -> None:
+    """A reader who is faster than the supervisor learns where the output of a program begins."""
+    before = time.time() - 1.0  # the kernel stamps files with a coarse clock
+    start(keeper, 7, b"hello\n")
+    (when, *first), *_ = read(tmp_path, pid=7).marks
+    assert first == [0, 7]
+    assert before < when <= time.time()
+    assert [mark[1:] for mark in read(tmp_path, 2, pid=7).marks] == [(6, 0)]
 
 
 @pytest.mark.parametrize("died", [False, True])
