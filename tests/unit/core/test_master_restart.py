@@ -299,3 +299,18 @@ def test_a_registered_host_has_the_reservations_of_its_processes_at_once() -> No
     (instance,) = cluster.state.instances_of(host)
     memory = cluster.state.hosts.resources.index("memory")
     assert instance.reserved[memory] > 0.3
+
+
+@pytest.mark.parametrize(("ran", "is_placed"), [(11.0, True), (9.0, False)])
+def test_the_readings_show_the_load_of_what_ran_before_the_restart(
+    ran: float, is_placed: bool
+) -> None:
+    """Otherwise a host with many processes would get no work for `settle` after a restart."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB), settle=10.0)
+    cluster.with_processes(*(process(f"p{number}") for number in range(9)))
+    cluster.wait(ran)
+    cluster.machines["a"].busy["memory"] = 0.2
+    cluster.restart_master()
+    cluster.wait(0.3)
+    cluster.submit(process("new"))
+    assert (cluster.phase("new") == "running") is is_placed

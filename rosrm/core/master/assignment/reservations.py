@@ -26,7 +26,7 @@ def review_reservation(state: MasterState, instance: Instance, now: float) -> No
 def settle_reservation(state: MasterState, instance: Instance, now: float) -> None:
     """Lower the reservation of an instance to the part that the readings do not show yet."""
     table, host = state.hosts, instance.host
-    instance.settled = now - instance.since >= state.settings.settle
+    instance.settled = instance.settled or now - instance.since >= state.settings.settle
     instance.shown = _is_shown(instance, now, state.settings.settle)
     ended = instance.estimated if instance.settled else frozenset()
     if instance.shown:

@@ -142,9 +142,15 @@ def _restore_instances(
             needs = state.estimate(process.spec)
             held = state.add_instance(instance, host, now, needs, devices=devices)
             held.node_name = str(aliases.get(number, ""))
+            held.settled = number == str(item["owner"]) and _has_run(state, process, now)
         else:
             adopt_to_stop(state, instance, host, now)
     process.owner = item["owner"] if item["owner"] in process.instances else 0
+
+
+def _has_run(state: MasterState, process: Process, now: float) -> bool:
+    """Return True if the owner of a process has run for so long that the readings show its load."""
+    return process.phase is ProcessPhase.RUNNING and now - process.since >= state.settings.settle
 
 
 def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
