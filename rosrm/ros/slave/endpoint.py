@@ -37,11 +37,14 @@ _log = logging.getLogger("rosrm.slave")
 
 #: Seconds for one request to the master.
 _PATIENCE: Final = 3.0
-#: Seconds after which a long poll is repeated, because it may have been lost. The first poll after
-#: a registration is repeated sooner, because it may have been sent before DDS discovery was
-#: complete; the interval then doubles.
+#: Seconds after which a long poll is repeated, because it may have been lost.
 _POLL_AGAIN: Final = 30.0
-_FIRST_POLL_AGAIN: Final = 1.0
+#: The same for the first handshake and the first poll, which may be sent before DDS has discovered
+#: the master: for `LEASE` a killed master's services still look ready. Then the interval grows.
+_FIRST_AGAIN: Final = 0.25
+#: Factor by which the interval of handshakes grows: with few of them, a thousand slaves that lost
+#: their master do not keep the next one from answering.
+_GREET_SELDOM: Final = 4.0
 #: Seconds between a refused request for work and the next one.
 _ASK_AGAIN: Final = 0.2
 #: Seconds for which registration is retried while the name is taken: the former run of this slave
@@ -117,6 +120,7 @@ class SlaveEndpoint:
         self._greeting = srv.Handshake.Response()
         self._greeted_at = 0.0
         self._asked_at = 0.0
+        self._greet_again = _FIRST_AGAIN
         self._beat_clock = BeatClock()
         self._newest_beat: msg.MasterBeat | None = None
         self._incarnation = 0  # of the master of this registration, complete or in progress
@@ -126,7 +130,7 @@ class SlaveEndpoint:
         self._leaves: Sequence[InstanceStatus] | None = None  # left running when the slave leaves
         self._poll: Call | None = None
         self._poll_at = 0.0
-        self._poll_again = _FIRST_POLL_AGAIN
+        self._poll_again = _FIRST_AGAIN
         self._status_sequence = 0
         self._silent_since = math.inf  # -inf: the silence is logged
         self._strangers = 0
@@ -177,7 +181,7 @@ class SlaveEndpoint:
     def advance(self, now: float) -> None:
         """Take the next step towards a registration; called in every cycle."""
         self._control.expire(now)
-        if self.link is MasterLink.SEARCHING and self._clients[srv.Handshake].service_is_ready():
+        if self._should_greet(now) and self._clients[srv.Handshake].service_is_ready():
             self._greet(now)
         if self.link is MasterLink.LISTENING and now - self._greeted_at >= _PATIENCE:
             self.link = MasterLink.SEARCHING
@@ -190,7 +194,15 @@ class SlaveEndpoint:
             self._strangers_at = now
             self.publish_statuses((), complete=False)
 
+    def _should_greet(self, now: float) -> bool:
+        """Return True if a handshake is due: none was sent, or the newest has had no answer yet."""
+        if self.link is not MasterLink.GREETING:
+            return self.link is MasterLink.SEARCHING
+        return now - self._asked_at >= self._greet_again
+
     def _greet(self, now: float) -> None:
+        if self.link is MasterLink.GREETING:
+            self._greet_again = min(_GREET_SELDOM * self._greet_again, _PATIENCE)
         self.link = MasterLink.GREETING
         self._asked_at = now
         request = srv.Handshake.Request(
@@ -198,13 +210,17 @@ class SlaveEndpoint:
             name=self.description.name,
         )  # fmt: skip
         self._control.call(
-            self._clients[srv.Handshake], request, now + _PATIENCE, self._take_greeting
-        )
+            self._clients[srv.Handshake], request, now + _PATIENCE,
+            lambda answer: self._take_greeting(answer, now),
+        )  # fmt: skip
 
-    def _take_greeting(self, answer: srv.Handshake.Response | None) -> None:
+    def _take_greeting(self, answer: srv.Handshake.Response | None, asked_at: float) -> None:
         now = time.monotonic()
-        if answer is None or now - self._asked_at >= _PATIENCE:  # this process was stopped
-            self.link = MasterLink.SEARCHING
+        if self.link is not MasterLink.GREETING:
+            return  # another of the repeated requests was answered first
+        if answer is None or now - asked_at >= _PATIENCE:  # this process was stopped
+            if asked_at == self._asked_at:
+                self.link = MasterLink.SEARCHING
             return
         fault = version_refusal(answer.protocol_version, f"the master on {answer.hostname}")
         if fault or not answer.accepted:
@@ -260,7 +276,7 @@ class SlaveEndpoint:
         self._registered_with, self.epoch = self._incarnation, answer.epoch
         self._beat_period = response.beat_period
         self._beat_at = now
-        self._poll_again = _FIRST_POLL_AGAIN
+        self._poll_again = _FIRST_AGAIN
         self._reporter.begin(self.host_id, self._beat_period)
         self.link = MasterLink.REGISTERED
         self._take(events.ContactConfirmed(self._asked_at))
@@ -313,6 +329,7 @@ class SlaveEndpoint:
         self.link = MasterLink.SEARCHING
         self._poll_at = 0.0
         self._newest_beat = None
+        self._greet_again = _FIRST_AGAIN
         self._control.forget()
         self._take(events.MasterLost())
         _log.info("%s", reason)
