@@ -72,8 +72,10 @@ _log = logging.getLogger("rosrm.master")
 _TICK: Final = 0.05
 #: Least seconds to the tick at which the lease of a host ends.
 _SOON: Final = 0.005
-#: Seconds for the discovery of another running master.
+#: Seconds for the discovery of another running master, from the creation of the participant, and
+#: the least seconds of these for its answer to a handshake.
 _DISCOVERY: Final = 1.0
+_ANSWER: Final = 0.5
 #: Seconds within which two starts of masters count as simultaneous.
 _AT_ONCE: Final = 1.0
 #: Seconds of plugin calls in one turn; beyond this limit the core's clock is set back by them.
@@ -136,7 +138,7 @@ class MasterRuntime:
         self._held: JournalStall | None = None
         self._deadlines = Deadlines()
         self._from_threads: deque[Callable[[], None]] = deque()
-        self._behind = 0.0  # seconds that the core's clock is behind, after blocked time
+        self._behind = 0.0  # seconds that the core's clock is behind, by its start and blocked time
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -154,21 +156,24 @@ class MasterRuntime:
             security = master_security(config.security)
             self._participant = Participant(config.ros, "rosrm_master")
             opened.callback(self._participant.close)
+            joined = self._now()
             self._endpoints = SealedEndpoints(self._participant, security)
             self._grants = GrantsWatch(security)
-            self._refuse_second()
+            last = self._last_run()
+            # Meanwhile, DDS discovers another master, if there is one.
+            self._state = self._restored(placement, strategies, last, joined)
+            self._refuse_second(max(_ANSWER, joined + _DISCOVERY - self._now()))
+            self._behind = self._now() - joined  # no host could report in that time
             opened.callback(self._end_record)
-            self._state = self._restored(placement, strategies)
+            self._begin_run(last, joined)
             self._endpoint = self._new_endpoint()
             self._diagnostics = self._new_diagnostics()
             self._closing = opened.pop_all()
 
-    def _refuse_second(self) -> None:
+    def _refuse_second(self, timeout: float) -> None:
         me = self._config.name
         security: Member = self._endpoints.security.client()
-        first = find_master(
-            SealedEndpoints(self._participant, security), f"master {me}", _DISCOVERY
-        )
+        first = find_master(SealedEndpoints(self._participant, security), f"master {me}", timeout)
         if first is not None:
             raise Refused(
                 f"a master runs already on {self._config.ros.describe()}: {first.master!r}, pid "
@@ -177,12 +182,12 @@ class MasterRuntime:
             )
 
     def _restored(
-        self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy]
-    ) -> MasterState:
-        last = self._last_run()
-        epoch = last.epoch + 1
+        self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy],
+        last: _LastRun, now: float,
+    ) -> MasterState:  # fmt: skip
+        """Return the state of the former run; this changes nothing in the journal."""
         state = MasterState(
-            self._config.core(), placement, strategies, epoch, declared=self._declared
+            self._config.core(), placement, strategies, last.epoch + 1, declared=self._declared
         )
         state.plugins.limit = self._deadlines
         state.chain_of = self._reload.chain_of
@@ -190,25 +195,28 @@ class MasterRuntime:
         state.wall = time.time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
-        now = self._now()
         try:
             restore.restore(state, self._journal.intents, now)
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
+        return state
+
+    def _begin_run(self, last: _LastRun, now: float) -> None:
+        """Make the begin of this run durable, before anything is decided in it."""
+        state = self._state
         journal_gap.begin(state, last.newest, now, machine_rebooted=last.machine_rebooted)
-        started = f"master {self._config.name} started, epoch {epoch}"
+        started = f"master {self._config.name} started, epoch {state.epoch}"
         self._journal.write(
             [Record(EventKind.MASTER_STARTED, message=started)],
             # Both in one group, because from the boot id alone the next master cannot tell which
             # hosts this one waited for.
             [
-                Intent("cluster", "epoch", {"epoch": epoch, "boot": _boot()}),
+                Intent("cluster", "epoch", {"epoch": state.epoch, "boot": _boot()}),
                 journal_gap.intent(state),
             ],
             0.0,
         )
         self._record_from(state, now)
-        return state
 
     def _last_run(self) -> _LastRun:
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
