@@ -125,6 +125,7 @@ class MasterEndpoint:
             silent_hosts: numbers of the hosts whose messages the master does not receive.
             journal: sequence of the newest written record.
         """
+        self.links.note_silent(silent_hosts)
         identity = self._identity
         self._beats.publish(
             msg.MasterBeat(

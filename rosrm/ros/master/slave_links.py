@@ -57,7 +57,8 @@ class HostLink:
     Attributes:
         slave: the registered slave; None: its key was revoked.
         incarnation: of the run that registered last; messages of a former run are ignored.
-        is_discovered: DDS has discovered the slave's service since its registration.
+        is_discovered: DDS has discovered the slave's service since its registration, or since the
+            master received nothing from it.
         deferred: orders and requests of it that wait for its first beat.
         introductions: introductions to it that wait for its first beat.
         outbox: assignments for the answer to its open request.
@@ -203,6 +204,15 @@ class HostLinks:
                 self._shut(link)
                 self.reading_stats.forget(link.host_id)
                 self._handle(happened.KeyRevoked(link.host_id, link.incarnation))
+
+    def note_silent(self, host_ids: Iterable[int]) -> None:
+        """Look again for the services of silent hosts, which DDS forgets after its lease.
+
+        Such a slave need not register again: with a cut in one direction it receives the beats.
+        """
+        for host_id in host_ids:
+            if host_id in self._links:
+                self._links[host_id].is_discovered = False
 
     def left(self, link: HostLink) -> None:
         """Close the open request of a slave that stops in an orderly way."""

@@ -105,6 +105,20 @@ def test_discovery_is_asked_once_for_each_registration(links, control):
     assert links._client.beats == [100, 100]
 
 
+def test_discovery_is_asked_again_after_a_silence(links, control):
+    """DDS may have forgotten the slave, which still receives the beats and registers no more."""
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
+    links.note_silent([HOST, HOST + 1])
+    control.ready = False
+    links.order(SendOrder(2, HOST, ReportInstances()), now=0.0)
+    assert links._client.beats == [100]
+    control.ready = True
+    receive_reading(links, beat=200, sequence=2)
+    assert links._client.beats == [100, 200]
+
+
 def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
     """A host that was cut off has only old readings; an order with their beat would be stale."""
     client = links._client
