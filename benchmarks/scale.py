@@ -68,6 +68,10 @@ _END = 15.0
 _JOBS = 30
 #: Seconds between two jobs.
 _PAUSE = 0.1
+#: Processes of one request.
+_AT_ONCE = 200
+#: States of a process before its start.
+_BEFORE = frozenset({"queued", "assigned", "starting"})
 
 
 class Loads:
@@ -193,6 +197,19 @@ def _next_report(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 def _ended(process: subprocess.Popen[str]) -> RosrmError:
     return RosrmError(f"simulated slaves ended with exit code {process.wait(_END)}; see above")
+
+
+def start_processes(cluster: LocalCluster, count: int, timeout: float) -> None:
+    """Submit so many services, and wait until all of them are placed."""
+    names = [f"process_{number}" for number in range(count)]
+    for start in range(0, count, _AT_ONCE):  # a busy machine needs longer for all of them
+        part = names[start : start + _AT_ONCE]
+        cluster.client.submit([ProcessSpec(name, command=("true",)) for name in part])
+    cluster.wait_until(
+        f"{count} processes are placed",
+        lambda view: not any(row.state in _BEFORE for row in view.processes),
+        timeout,
+    )
 
 
 def readings(crowd: Crowd, loads: Loads, seconds: float) -> dict[str, float]:

@@ -124,7 +124,7 @@ class SimulatedSlave:
         resources = tuple(ResourceDescription(*one) for one in _RESOURCES)
         description = HostDescription(
             name, int.from_bytes(os.urandom(7), "big") | 1, hostname=socket.gethostname(),
-            pid=os.getpid(), resources=resources, period=period,
+            pid=os.getpid(), labels={"host": name}, resources=resources, period=period,
         )  # fmt: skip
         self.endpoint = SlaveEndpoint(endpoints, description, self._state, take=self.take)
         duties = Duties(self.take, *[self._refuse] * (len(fields(Duties)) - 1))

@@ -34,12 +34,11 @@ from playwright.sync_api import Browser, Page
 
 from benchmarks.browser import browser
 from benchmarks.machine import parser, print_report, say
-from benchmarks.scale import Crowd
+from benchmarks.scale import Crowd, start_processes
 from benchmarks.slave_cost import pss_mib
 from benchmarks.stopping import run
 from rosrm.config.settings import ClusterConfig
 from rosrm.errors import RosrmError
-from rosrm.model.values import ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
 
 #: Requests for each time of an answer.
@@ -47,8 +46,6 @@ _REQUESTS = 10
 #: Seconds between two requests, beyond the time for which the gateway uses a listing again.
 _PAUSE = 0.3
 _PATIENCE = 120.0
-#: Processes of one request.
-_AT_ONCE = 200
 #: Openings of the page for `first_paint_ms`.
 _PAINTS = 5
 #: In the page: the milliseconds since its navigation once rows are there, after the next frame.
@@ -57,8 +54,6 @@ _DRAWN = """() => document.querySelector('[aria-label=Hosts] .ag-row .ag-cell')
 _TAB_DRAWN = "() => document.querySelector('[aria-label=Processes] .ag-row .ag-cell')"
 _CORDONED = """host => [...document.querySelectorAll('[aria-label=Hosts] .ag-row')]
     .some(row => row.textContent.includes(host) && row.textContent.includes('cordoned'))"""
-#: States of a process before its start; for the gateway only the number of rows matters.
-_BEFORE = frozenset({"queued", "assigned", "starting"})
 
 
 @contextmanager
@@ -161,16 +156,8 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
         crowd = Crowd(cluster.domain, 10.0, 0.0, _PATIENCE)
         opened.callback(crowd.close)
         crowd.start(arguments.hosts, 1)
-        names = [f"process_{number}" for number in range(arguments.processes)]
-        for start in range(0, len(names), _AT_ONCE):  # a busy machine needs longer for all of them
-            part = names[start : start + _AT_ONCE]
-            cluster.client.submit([ProcessSpec(name, command=("true",)) for name in part])
-        cluster.wait_until(
-            f"{len(names)} processes are placed",
-            lambda view: not any(row.state in _BEFORE for row in view.processes),
-            _PATIENCE,
-        )
-        say(f"{arguments.hosts} hosts, {len(names)} processes")
+        start_processes(cluster, arguments.processes, _PATIENCE)
+        say(f"{arguments.hosts} hosts, {arguments.processes} processes")
         process, port = opened.enter_context(gateway(cluster))
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_PATIENCE)
         opened.callback(connection.close)
