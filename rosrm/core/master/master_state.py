@@ -80,6 +80,8 @@ class MasterState:
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
         scheduled: names of the processes with a schedule that are not terminal.
+        nodes: each node of the ROS graph to the names of the processes with it that are not
+            terminal.
         applications: by name.
         modes: sets of applications, and the one in force.
         terminal: names of the terminal processes, in the order in which they ended.
@@ -140,6 +142,7 @@ class MasterState:
         self.unamended: dict[str, PendingAmendment] = {}
         self.time_limited: dict[str, None] = {}
         self.scheduled: dict[str, None] = {}
+        self.nodes: dict[str, dict[str, None]] = {}
         self.preemption = Preemption()
         self.rebalancing = Rebalancing()
         self.reloads = Reloads()
@@ -262,11 +265,13 @@ class MasterState:
         """Move a process to another phase; a run of a schedule ends in the phase SCHEDULED."""
         if process.spec.schedule and phase in _ENDS_OF_RUNS:
             phase, reason = self._after_run(process, phase, reason)
+        process.reason = reason
         if process.phase is not phase:
+            before = process.phase
             self._begin_phase(process, phase, now)
             self.start_orders.note_change(process.name)
-        process.reason = reason
-        self._update_terminal(process)
+            if process.awaits_gang or phase.is_terminal != before.is_terminal:
+                self._update_terminal(process)
 
     def _after_run(
         self, process: Process, end: ProcessPhase, reason: str
@@ -321,6 +326,8 @@ class MasterState:
                 self.neighbours.add(process.spec)
             if process.spec.start_order.after:
                 self.start_orders.add(process.spec)
+            if process.node:
+                self.nodes.setdefault(process.node, {})[process.name] = None
             self.flows.declare(process.name, process.spec.talks_to)
         else:
             self.terminal.setdefault(process.name)
@@ -329,7 +336,14 @@ class MasterState:
             self.scheduled.pop(process.name, None)
             self.neighbours.remove(process.name)
             self.start_orders.remove(process.name)
+            self._forget_node(process)
             self.flows.remove(process.name)
+
+    def _forget_node(self, process: Process) -> None:
+        users = self.nodes.get(process.node, {})
+        users.pop(process.name, None)
+        if not users:
+            self.nodes.pop(process.node, None)
 
     def set_spec(self, process: Process, spec: ProcessSpec) -> None:
         """Replace the spec of a process, and note what other parts of the state read of it."""
@@ -340,6 +354,7 @@ class MasterState:
         if spec.together != process.spec.together:
             awaits_gang = bool(spec.together) and (awaits_gang or in_line)
             self.gangs.leave(process)
+        self._forget_node(process)
         process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
         process.demand, process.awaits_gang = None, awaits_gang
         self.wants_standby.pop(process.name, None)

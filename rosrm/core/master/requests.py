@@ -77,10 +77,9 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     for process in processes:
         if process.spec.adoption != NO_ADOPTION:
             assign_to_adopt(state, process, now)
-    nodes, names = {one.node for one in processes}, {one.name for one in processes}
-    users = [one for one in state.processes.values() if one.node in nodes]
-    others = [one for one in users if not one.phase.is_terminal and one.name not in names]
-    doubts = shared_nodes((one.name, one.node) for one in [*processes, *others])
+    own = {one.name: one.node for one in processes}
+    others = {name: node for node in own.values() for name in state.nodes.get(node, ())}
+    doubts = shared_nodes({**own, **others}.items())
     doubts += unknown_resources(state.hosts, specs)
     warnings = "".join(f". Warning: {one}" for one in doubts)
     state.emit(Reply(event.request, message=f"{_accepted(processes)}{warnings}"))

@@ -8,6 +8,7 @@ import numpy as np
 
 from rosrm.core.master.assignment.neighbours import locate
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.host_arrays import TIE
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import BEFORE_START, DesiredState, ProcessPhase
 
@@ -30,6 +31,11 @@ def no_process_is_lost(state: MasterState) -> None:
             waits_for_an_end = process.wanted is not DesiredState.RUN and process.instances
             assert process.owner in state.instances or waits_for_an_end, (name, phase)
     assert queued <= set(state.processes)
+    terminal = {name for name, process in state.processes.items() if process.phase.is_terminal}
+    assert terminal == set(state.terminal)
+    nodes = {(name, state.processes[name].node) for name in state.processes.keys() - terminal}
+    indexed = {(name, node) for node, names in state.nodes.items() for name in names}
+    assert indexed == {(name, node) for name, node in nodes if node}
 
 
 def the_books_balance(state: MasterState) -> None:
@@ -47,6 +53,7 @@ def the_books_balance(state: MasterState) -> None:
         held = [state.instances[number] for number in host.instances]
         assert all(instance.host is host for instance in held)
         assert state.hosts.processes[host.column] == len(held)
+        assert state.hosts.ties[host.column] == TIE * len(held)
         total = np.zeros(len(state.hosts.resources))
         for instance in held:
             assert (instance.reserved >= 0.0).all()

@@ -208,7 +208,7 @@ def _first_request_awaited(state: MasterState, now: float) -> str:
 def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     """Return the processes that wait for a time or snapshot, and do not block those behind them."""
     delayed = _delayed(state, now)
-    if not state.hosts.condition.any() or not state.hosts.having(_AWAY).any():  # UP is 0
+    if not state.hosts.any_having(_AWAY):
         return delayed
     names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
     for name in names:

@@ -3,6 +3,7 @@
 filters.py      placement rules: masks over hosts, with the reasons against hosts
 plugin_filters.py   placement rules of plugins
 ranking.py      filter, score, pick
+shortlist.py    the hosts with the lowest scores
 decision.py     outcome with its reasons, for `rosrm explain`
 proximity.py    hosts near other processes or apart from them
 traffic.py      load that the flows of a process would put on links

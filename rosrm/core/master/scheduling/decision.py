@@ -22,8 +22,8 @@ from rosrm.core.master.scheduling.filters import (
 )
 from rosrm.core.master.scheduling.host_views import host_view, process_view
 from rosrm.core.master.scheduling.proximity import unmet
-from rosrm.core.master.scheduling.ranking import TIE, Ranking
-from rosrm.core.master.state.host_arrays import FloatArray
+from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.host_arrays import TIE, FloatArray
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Scores
 from rosrm.extensions.placement import ScoringLink
@@ -191,7 +191,7 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     # With many hosts, only the runners-up are named, because this path must be quick.
     first = [host.column for host in listed[:_NAMED_HOSTS]] if column < 0 else ranking.lowest()
     moment = _moment(ranking, _first(column, first))
-    named, fitting = len(moment.value), int(np.count_nonzero(ranking.value < np.inf))
+    named, fitting = len(moment.value), ranking.fitting()
     named_fitting = named - moment.value.tolist().count(np.inf)
     omitted = {
         "would take it at a higher score": fitting - named_fitting,

@@ -24,13 +24,15 @@ T = TypeVar("T")
 
 
 def host_view(hosts: Candidates) -> HostView:
-    """Return the view of some hosts for a plugin."""
-    return _View(
-        _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
-        _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-        _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts), _Tenants(hosts),
-        _FreeDevices(hosts),
-    )  # fmt: skip
+    """Return the view of some hosts for a plugin, the same one for all plugins."""
+    if hosts.view is None:
+        hosts.view = _View(
+            _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
+            _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
+            _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts), _Tenants(hosts),
+            _FreeDevices(hosts),
+        )  # fmt: skip
+    return hosts.view
 
 
 class _View(HostView):

@@ -32,21 +32,17 @@ from rosrm.core.master.scheduling.filters import (
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
+from rosrm.core.master.scheduling.shortlist import Shortlist
 from rosrm.core.master.scheduling.traffic import keeping_limits, rows_of
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.devices import COUNTED
-from rosrm.core.master.state.host_arrays import BoolArray, FloatArray, IntArray
+from rosrm.core.master.state.host_arrays import TIE, BoolArray, FloatArray, IntArray
 from rosrm.core.master.state.hosts import HostTable
 from rosrm.errors import PluginError
 from rosrm.extensions.declared_fields import FLOWS_FIELD
 from rosrm.extensions.link_views import FlowView
 from rosrm.extensions.placement import ScoringLink
 
-#: Added to the score for each process of a host: of equal scores, the host with fewer processes is
-#: picked, then the one that registered first.
-TIE: Final = 1e-9
-#: Number of runners-up that an explanation names beside the chosen host, if there are many hosts.
-_RUNNERS_UP: Final = 3
 #: Number of equal processes for which one call of the policy scores a host ahead.
 _AT_A_TIME: Final = COUNTED
 
@@ -71,6 +67,7 @@ class Ranking:
         self.demand = demand
         self.need = table.fractions(demand.amounts, demand.estimated)
         self._every = slice(0, len(table))
+        self._all: Candidates | None = None
         self._steady = passing(STEADY, self._candidates(self._every))
         self._steady_version = table.version_without_readings
         self._tier = _tiers(table, demand)
@@ -78,6 +75,7 @@ class Ranking:
         self._flows: FlowView | None = None
         self._alone: Ranking | None = None
         self.value: FloatArray
+        self._lowest: list[int] | None
         self._judge_all()
 
     def _judge_all(self) -> None:
@@ -89,7 +87,6 @@ class Ranking:
         judged = self._candidates(self._every)
         self._standing = passing(BY_READING, judged, self._steady)
         self._refusals: dict[int, Refusal | None] = {}
-        self._lowest: list[int] | None = None
         self._ahead: dict[int, list[float]] = {}
         self._judge(judged)
 
@@ -112,15 +109,16 @@ class Ranking:
         return found
 
     def _set_surroundings(self, demand: Demand, alone: Ranking) -> None:
-        self.demand, self._alone, self._lowest = demand, alone, None
+        self.demand, self._alone, self._all = demand, alone, None
         self._refusals, self._ahead = {}, {}
         self._preference = preference(self.table, demand)
-        self.value = self.value + (0.0 if self._preference is None else self._preference)
+        value = self.value + (0.0 if self._preference is None else self._preference)
         limits = keeping_limits(self.table.links, demand.traffic, len(self.table))
         for kept in (keeping_all(self.table, demand), limits):
             if kept is not None:
                 self._standing = self._standing & kept
-                self.value[~kept] = np.inf
+                value[~kept] = np.inf
+        self._set_values(value)
         if demand.flows_are_read:
             self._judge_flows(alone)
 
@@ -137,7 +135,7 @@ class Ranking:
         if value is None:
             self._judge(judged)
         else:
-            self.value = value
+            self._set_values(value)
 
     def note_assignment(self) -> None:
         """Note that the newest change of the table was an assignment of this demand."""
@@ -158,6 +156,7 @@ class Ranking:
         if self.version != self.table.version:
             if self.demand.estimated:  # a part of the limits, which readings report
                 self.need = self.table.fractions(self.demand.amounts, self.demand.estimated)
+                self._all = None
             self._judge_all()
             return
         touched = self.table.touched
@@ -181,22 +180,13 @@ class Ranking:
     def lowest(self) -> list[int]:
         """Return the few fitting columns with the lowest values, best first."""
         if self._lowest is None:
-            self._lowest = self._find_lowest() if len(self.value) else []
+            tier, listed = self._tier, self._shortlist
+            self._lowest = (listed if tier is None else self._preferred(tier)).lowest()
         return self._lowest
 
-    def _find_lowest(self) -> list[int]:
-        value = self._preferred()
-        found, were = [], []
-        for _ in range(1 + _RUNNERS_UP):
-            column = int(value.argmin())
-            was = value[column]
-            if was == np.inf:
-                break
-            found.append(column)
-            were.append(was)
-            value[column] = np.inf  # one more argmin costs less than a sort
-        value[found] = were
-        return found
+    def fitting(self) -> int:
+        """Return the number of hosts that may take the process now."""
+        return self._shortlist.finite()
 
     def in_order(self) -> list[int]:
         """Return all fitting columns, best first: by the tier of labels, then by value."""
@@ -226,14 +216,21 @@ class Ranking:
 
     def _judge(self, judged: Candidates) -> None:
         """Set `value` of some hosts."""
-        self._lowest = None
         value = self._value(judged)
         if value is None:
             self._judge_at(self._every)  # scores of two policies are not comparable
-        elif judged.columns is self._every:
-            self.value = value
+        elif isinstance(judged.columns, slice):
+            self._set_values(value)
         else:
-            self.value[judged.columns] = value
+            self._put(judged.columns.tolist(), value.tolist())
+
+    def _set_values(self, value: FloatArray) -> None:
+        """Set `value` of all hosts."""
+        self.value, self._shortlist, self._lowest = value, Shortlist(value), None
+
+    def _put(self, columns: list[int], values: list[float]) -> None:
+        self._shortlist.put(columns, values)
+        self._lowest = None
 
     def _judge_ahead(self, column: int) -> None:
         """Set `value` of a column that just took a process of this demand.
@@ -252,19 +249,27 @@ class Ranking:
                 self._judge_at(np.array([column]))
                 return
             values = self._ahead[column] = ahead[::-1].tolist()
-        self._lowest = None
-        self.value[column] = values.pop()
+        self._put([column], [values.pop()])
 
     def _candidates(self, columns: Columns, more: IntArray | None = None) -> Candidates:
-        """Return some hosts with the demand; `more` as in `candidates`."""
-        return candidates(self.table, self.demand, self.need, columns, more)
+        """Return some hosts with the demand; `more` as in `candidates`.
+
+        Those of all hosts are kept, because their arrays are those of the table.
+        """
+        if columns is not self._every:
+            return candidates(self.table, self.demand, self.need, columns, more)
+        if self._all is None or self.demand.spec.devices:  # whose counts are not in the table
+            self._all = candidates(self.table, self.demand, self.need, columns)
+        return self._all
 
     def _value(self, judged: Candidates) -> FloatArray | None:
         """Return the values of hosts; None: the policy was left out, so all values are void."""
         columns = judged.columns
         judged.known_flows = self.flows(columns)
         fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
-        value: FloatArray = np.multiply(judged.processes, TIE, dtype=np.float64)
+        value = self.table.ties[columns]
+        if judged.more is not None:
+            value = np.multiply(judged.processes, TIE, dtype=np.float64)
         if self._preference is not None:
             value = value + self._preference[columns]
         return self._scored(self.judges, judged, fits, value)
@@ -283,8 +288,7 @@ class Ranking:
             if veto is not None:
                 fits = fits & ~veto
         self.reads_tenants = self.reads_tenants or judged.tenants_read
-        np.copyto(value, np.inf, where=~fits)
-        return value
+        return np.where(fits, value, np.inf)
 
     def flows(self, columns: Columns) -> FlowView | None:
         """Return the flows of the process on some hosts; None: no plugin has read them."""
@@ -302,15 +306,12 @@ class Ranking:
         self.failure = f"{self.failure}; {reason}" if self.failure else reason
         self._ahead.clear()
 
-    def _preferred(self) -> FloatArray:
-        """Return the values of the best tier of labels among fitting hosts; inf elsewhere."""
-        if self._tier is None:
-            return self.value
+    def _preferred(self, tier: IntArray) -> Shortlist:
+        """Return the hosts of the best tier of labels among fitting hosts."""
         fitting = self.value < np.inf
         if not fitting.any():
-            return self.value
-        best = self._tier[fitting].min()
-        return np.where(self._tier == best, self.value, np.inf)
+            return self._shortlist
+        return Shortlist(np.where(tier == tier[fitting].min(), self.value, np.inf))
 
 
 def _answer(

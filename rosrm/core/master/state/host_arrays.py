@@ -22,6 +22,9 @@ IntArray = npt.NDArray[np.int64]
 USAGE, LOAD, LIMIT, CAPACITY, BUSY, OWN_LIMIT = range(6)
 _ABSENT: Final = (np.nan, 0.0, 1.0, np.nan, np.nan, 1.0)
 
+#: Added to the score for each process of a host: of equal scores, the host with fewer processes is
+#: picked, then the one that registered first.
+TIE: Final = 1e-9
 #: Number of processes that means "no bound".
 NO_BOUND: Final = 2**62
 
@@ -48,6 +51,7 @@ class HostColumns:
         registered: (H,) time of the registration.
         period: (H,) seconds between two readings.
         processes: (H,) number of processes on the host or reserved for it.
+        ties: (H,) `TIE` for each of them.
         bound: (H,) highest number of processes.
         incarnation: (H,) incarnation of the slave.
         sequence: (H,) sequence of the newest reading.
@@ -81,6 +85,7 @@ class HostColumns:
             "registered": np.full(columns, -np.inf),
             "period": np.zeros(columns),
             "processes": np.zeros(columns, np.int64),
+            "ties": np.zeros(columns),
             "bound": np.full(columns, NO_BOUND, np.int64),
             "incarnation": np.zeros(columns, np.uint64),
             "sequence": np.zeros(columns, np.uint64),
@@ -145,6 +150,7 @@ class HostColumns:
         self.registered: FloatArray = used["registered"]
         self.period: FloatArray = used["period"]
         self.processes: IntArray = used["processes"]
+        self.ties: FloatArray = used["ties"]
         self.bound: IntArray = used["bound"]
         self.incarnation: npt.NDArray[np.uint64] = used["incarnation"]
         self.sequence: npt.NDArray[np.uint64] = used["sequence"]
@@ -152,6 +158,10 @@ class HostColumns:
         self.status_sequence: npt.NDArray[np.uint64] = used["status_sequence"]
         self.refused_since: FloatArray = used["refused_since"]
         self.row_of_slot: IntArray = used["row_of_slot"]
+
+    def set_processes(self, column: int, processes: int) -> None:
+        """Set the number of processes of a host."""
+        self.processes[column], self.ties[column] = processes, TIE * processes
 
     def clear_column(self, column: int) -> None:
         """Clear a column before its host registers its resources again; reservations stay."""

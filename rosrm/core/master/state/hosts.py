@@ -365,7 +365,7 @@ class HostTable(HostColumns):
         """Undo all reservations on a host since it was saved, without any rounding."""
         self.devices[saved.column] = saved.devices
         self.cells[:, :, saved.column] = saved.cells
-        self.processes[saved.column] = saved.processes
+        self.set_processes(saved.column, saved.processes)
         self.touched.append(saved.column)
 
     def touch(self, host: Host) -> None:
@@ -384,7 +384,8 @@ class HostTable(HostColumns):
         if processes <= 0:
             np.maximum(load, 0.0, out=load)  # rounding may leave less than 0
         np.add(cell[USAGE], load, out=cell[BUSY])
-        self.processes[column] += processes
+        if processes:
+            self.set_processes(column, int(self.processes[column]) + processes)
         self.touched.append(column)
 
     # --- queries -------------------------------------------------------------------------
@@ -441,6 +442,12 @@ class HostTable(HostColumns):
         wanted = np.zeros(len(HostCondition), np.bool_)
         wanted[list(conditions)] = True
         return wanted[self.condition]  # much faster than np.isin
+
+    def any_having(self, conditions: Sequence[HostCondition]) -> bool:
+        """Return True if a host has one of some conditions; fast if all hosts are up."""
+        if not np.count_nonzero(self.condition):  # UP is 0
+            return len(self) > 0 and HostCondition.UP in conditions
+        return bool(self.having(conditions).any())
 
     def silent_hosts(self) -> list[int]:
         """Return the ids of hosts that have reported and are silent now."""

@@ -256,6 +256,7 @@ class Process:
             soon as the conditions of its start order hold.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
+        name: as in its spec, which many read.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
     """
 
@@ -300,16 +301,12 @@ class Process:
     defaulted: tuple[str, ...] = ()
     next_spec: ProcessSpec | None = None
     demand: tuple[int, Demand] | None = None
+    name: str = field(init=False)
     plain: Plain = field(init=False)
     node: str = field(init=False)
 
     def __post_init__(self) -> None:
-        self.plain, self.node = Plain(self.spec), node_of(self.spec)
-
-    @property
-    def name(self) -> str:
-        """Return its name."""
-        return self.spec.name
+        self.name, self.plain, self.node = self.spec.name, Plain(self.spec), node_of(self.spec)
 
     @property
     def is_at_rest(self) -> bool:
@@ -329,6 +326,8 @@ class Process:
     @property
     def forbidden_hosts(self) -> dict[str, str]:
         """Return host name to the reason why the process must not run there."""
+        if not self.failed_on:
+            return dict(self.excluded)
         failed = {
             host: f"{self.name} failed there: {one.reason}" for host, one in self.failed_on.items()
         }

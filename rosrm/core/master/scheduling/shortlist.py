@@ -1,0 +1,90 @@
+"""The few lowest values of an array, kept while single values change."""
+
+from __future__ import annotations
+
+from bisect import insort
+from math import inf
+from typing import Final
+
+import numpy as np
+
+from rosrm.core.master.state.host_arrays import FloatArray
+
+#: Number of columns that a caller gets: the best one, and the runners-up in an explanation.
+WANTED: Final = 4
+#: Number of columns that a search finds once values change one by one, to need fewer searches.
+_AHEAD: Final = 8
+#: Number of changed values, or of columns in the list, above which a new search costs less.
+_MOST: Final = 32
+#: Comes after each finite value.
+_NONE: Final = (inf, -1)
+
+
+class Shortlist:
+    """The columns with the lowest finite values; of equal values, the lower column comes first.
+
+    A search costs one pass for each column that it finds. A changed value is moved in the list, and
+    causes a search only if too few columns are left.
+
+    Args:
+        value: (H,) values; inf: the column does not count. Only `put` may change them.
+    """
+
+    def __init__(self, value: FloatArray) -> None:
+        self._value = value
+        self._finite: int | None = None
+        self._lowest: list[tuple[float, int]] | None = None
+        self._end = _NONE  # each finite value that is not in the list comes after this one
+        self._searched = WANTED
+
+    def lowest(self) -> list[int]:
+        """Return the few columns with the lowest values, in order."""
+        if self._lowest is None:
+            self._lowest = self._search()
+        return [column for _, column in self._lowest[:WANTED]]
+
+    def finite(self) -> int:
+        """Return the number of finite values."""
+        if self._finite is None:
+            self._finite = int(np.count_nonzero(self._value < inf))
+        return self._finite
+
+    def put(self, columns: list[int], values: list[float]) -> None:
+        """Replace the values of some columns, each of which is given once."""
+        if len(columns) > _MOST:
+            self._value[columns] = values
+            self._lowest = self._finite = None
+            return
+        for column, new in zip(columns, values, strict=True):
+            old = float(self._value[column])
+            self._value[column] = new
+            if self._finite is not None:
+                self._finite += (new < inf) - (old < inf)
+            if self._lowest is not None and new != old:
+                self._move(self._lowest, (old, column), (new, column))
+
+    def _move(
+        self, lowest: list[tuple[float, int]], old: tuple[float, int], new: tuple[float, int]
+    ) -> None:
+        if old <= self._end:
+            lowest.remove(old)
+        if new <= self._end:
+            insort(lowest, new)
+        if len(lowest) > _MOST or (len(lowest) < WANTED and self._end is not _NONE):
+            self._lowest, self._searched = None, _AHEAD
+
+    def _search(self) -> list[tuple[float, int]]:
+        value, found = self._value, list[tuple[float, int]]()
+        self._end = _NONE
+        while len(found) < min(self._searched, len(value)):
+            column = int(value.argmin())
+            lowest = float(value[column])
+            if lowest == inf:
+                break
+            found.append((lowest, column))
+            value[column] = inf  # one more argmin costs less than a sort
+        else:
+            self._end = found[-1] if found else _NONE
+        for lowest, column in found:
+            value[column] = lowest
+        return found
