@@ -21,6 +21,7 @@ from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.limits import limits_in_words
+from rosrm.model.plan import Configure, HandoffPhase
 from rosrm.model.rows import DeviceRow, HostRow, ProcessRow, ResourceRow
 from rosrm.model.values import InstanceState, StopPolicy, qualified_name
 from rosrm.wording import amount, listed
@@ -180,6 +181,14 @@ def _host_of(process: Process, owner: Instance | None) -> str:
     return process.image.host if process.image is not None else process.ended_on
 
 
+def _missing_standby(state: MasterState, process: Process) -> str:
+    """Return why a running process has no ready standby; "": it has one, or asks for none."""
+    standby = state.standbys.get(process.name)
+    step = None if standby is None else standby.current_step
+    is_ready = isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH
+    return "" if is_ready or process.phase is not ProcessPhase.RUNNING else process.standby_reason
+
+
 def _awaited_node(process: Process, owner: Instance | None) -> str:
     """Return a phrase on the node that must join the ROS graph before a process is ready."""
     if owner is None or process.phase is not ProcessPhase.STARTING:
@@ -283,7 +292,8 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
     room = made.reason if made is not None else ""
     if position <= 1 or room or state.queue.head() == process.name:
         owner = state.instances.get(process.owner)
-        reason = _reason_of_phase(state, process) or _awaited_node(process, owner)
+        reason = _reason_of_phase(state, process) or _missing_standby(state, process)
+        reason = reason or _awaited_node(process, owner)
         return f"{reason}; {room}" if room and room != reason else reason
     ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
     return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"

@@ -77,6 +77,7 @@ def test_a_standby_waits_for_a_second_host_with_one_record() -> None:
     cluster.wait(30.0)
     assert cluster.recorded("standby_waits") == ["p: no host has room for its standby"]
     assert cluster.phase("p") == "running"
+    assert cluster.explain("p")["reason"] == "no host has room for its standby"
     cluster.add("b")
     cluster.wait(4.0)
     assert cluster.active() == ["a"]
@@ -153,6 +154,10 @@ def test_a_standby_that_is_never_ready_is_kept() -> None:
     cluster = with_standby(quirk="never ready", seconds=200.0)
     assert cluster.where("p") == ["a", "b"]
     assert not cluster.recorded("standby_lost")
+    assert cluster.explain("p")["reason"] == (
+        "its standby on b is not ready: p#2 receives the state of the source: waits for input "
+        "/scan; p#1 takes part in the handoff"
+    )
 
 
 def test_a_standby_that_does_not_start_in_time_is_replaced() -> None:

@@ -284,7 +284,7 @@ def timed_out(state: MasterState, migration: Migration, step: Configure, now: fl
             _stop_silent_destination(state, migration, now)
             return StepProgress.PENDING
     what = f"{TITLES[step.phase]} took longer than {step.timeout:g} s"
-    return StepFailed(f"{what}: {_newest_reports(migration)}", timed_out=True)
+    return StepFailed(f"{what}: {newest_reports(migration)}", timed_out=True)
 
 
 def _stop_silent_destination(state: MasterState, migration: Migration, now: float) -> None:
@@ -300,8 +300,8 @@ def _stop_silent_destination(state: MasterState, migration: Migration, now: floa
     state.save_migration(migration)
 
 
-def _newest_reports(migration: Migration) -> str:
-    """Return the newest report of source and destination, for a time-out."""
+def newest_reports(migration: Migration) -> str:
+    """Return the newest report of source and destination: what a phase waits for."""
     if not migration.handoff_reports:
         return (
             "neither node has reported. Do they use rosrm.node? A node that meets only the "

@@ -30,7 +30,7 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.plan import HandoffPhase, ReportPhase, Start
+from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Start
 
 #: Seconds between a failed standby and the next one; doubled with each failure.
 _FIRST_WAIT: Final = 2.0
@@ -174,6 +174,9 @@ def _advance(state: MasterState, process: Process, migration: Migration, now: fl
         _lost(state, process, migration, why, now)
     elif outcome is StepProgress.DONE:
         _note_ready(state, process, migration, now)
+    elif isinstance(migration.current_step, Configure):
+        host, waits = migration.destination_host.name, handoff.newest_reports(migration)
+        process.standby_reason = f"its standby on {host} is not ready: {waits}"
 
 
 def _note_ready(state: MasterState, process: Process, migration: Migration, now: float) -> None:
