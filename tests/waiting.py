@@ -82,6 +82,14 @@ def wait_gone(pid: int, timeout: float = PATIENCE) -> None:
 def command_of(pid: int) -> str:
     """Return the command line of a process; "" if it has ended."""
     try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
+        command = Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
         return ""
+    return command.replace(b"\0", b" ").decode(errors="replace")
+
+
+def all_commands() -> str:
+    """Return the command lines of all processes of this machine."""
+    return "\n".join(
+        command_of(int(one.name)) for one in Path("/proc").iterdir() if one.name.isdigit()
+    )

@@ -28,6 +28,7 @@ from rosrm.testing import (
     ProbeContract,
     ScoringContract,
 )
+from tests.waiting import PATIENCE
 
 #: Offer, method of the plugin, and first test of each contract.
 KINDS = {
@@ -172,7 +173,7 @@ def test_the_alarm_of_a_test_runner_stays_set():
     left, _ = signal.setitimer(signal.ITIMER_REAL, 0.2)
     try:
         contract_of(ProbeContract, FakeProbe(a=0.5)).test_reads_each_resource_once()
-        end = time.monotonic() + 5.0
+        end = time.monotonic() + PATIENCE
         while not heard:
             assert time.monotonic() < end
             time.sleep(0.01)

@@ -17,6 +17,7 @@ from rosrm.client.waiting import wait_for_applications
 from rosrm.config.settings import LivenessSettings, MigrationSettings
 from rosrm.config.work import load_application
 from rosrm.model.applications import ApplicationRow
+from rosrm.supervisor.procfs import read_environment
 from tests.faults.test_master_killed import HOLDER
 from tests.ros.clusters import Cluster, host, python
 from tests.waiting import PATIENCE, wait_until
@@ -68,8 +69,7 @@ def reach(cluster: Cluster) -> ApplicationRow:
 
 
 def version_of(pid: int) -> str:
-    environment = Path(f"/proc/{pid}/environ").read_bytes().split(b"\0")
-    (found,) = [one for one in environment if one.startswith(b"VERSION=")]
+    (found,) = [one for one in read_environment(pid) if one.startswith(b"VERSION=")]
     return found.decode().partition("=")[2]
 
 

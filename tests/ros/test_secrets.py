@@ -6,7 +6,7 @@ from pathlib import Path
 
 from rosrm.config.settings import RecordSettings
 from tests.ros.clusters import STEADY, host, python
-from tests.waiting import wait_until
+from tests.waiting import all_commands, wait_until
 
 SECRET = b"hush-4711"
 #: Ends with success if it has the secret, and prints only that.
@@ -23,11 +23,6 @@ def files_with(directory: Path, text: bytes) -> list[Path]:
     return [one for one in directory.rglob("*") if one.is_file() and text in one.read_bytes()]
 
 
-def command_lines() -> bytes:
-    """Return the command lines of all processes of this machine."""
-    return b"\n".join(one.read_bytes() for one in Path("/proc").glob("[0-9]*/cmdline"))
-
-
 def test_the_process_gets_its_secret_and_nobody_else(make_cluster, tmp_path) -> None:
     """Neither a file of master, slave and supervisor nor an answer to a client has the value."""
     token = tmp_path / "token"
@@ -41,7 +36,7 @@ def test_the_process_gets_its_secret_and_nobody_else(make_cluster, tmp_path) -> 
 
     answers = [cluster.client.explain("robot"), cluster.client.list(events=True)]
     assert SECRET.decode() not in str(answers)
-    assert SECRET not in command_lines()
+    assert SECRET.decode() not in all_commands()
     wait_until(lambda: files_with(records, b"robot"), "the recording has the process")
     assert files_with(cluster.directory, str(token).encode())
     assert not files_with(cluster.directory, SECRET)

@@ -158,13 +158,20 @@ def test_a_mode_is_switched_by_its_plan(page, cluster):
 )  # fmt: skip
 def test_a_wrong_work_file_is_refused_with_its_error(page, cluster, text, error):
     """The page shows the text of the error, and nothing changes."""
-    before = cluster.client.list(processes=True, applications=True).last_sequence
+    before = desired(cluster)
 
     dialog = plan(page, text)
 
     dialog.get_by_role("alert").filter(has_text=error).wait_for()
     assert dialog.get_by_role("button", name="Apply").count() == 0
-    assert cluster.client.list(processes=True).last_sequence == before
+    assert desired(cluster) == before
+
+
+def desired(cluster: Cluster) -> tuple[set[str], set[tuple[str, int]]]:
+    """Return the names of all processes, and all applications with their versions."""
+    there = cluster.client.list(processes=True, applications=True)
+    names = {row.name for row in there.processes}
+    return names, {(row.name, row.version) for row in there.applications}
 
 
 def test_a_plan_that_no_longer_holds_is_refused(page, cluster):

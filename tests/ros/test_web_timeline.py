@@ -76,7 +76,7 @@ def test_a_move_appears_live_with_its_arrow(page, cluster):
 
     cluster.client.migrate("mover")
     page.locator(ARROW).wait_for(state="attached")  # a vertical line has no area
-    assert f"{source} to robot-" in mark(page, "moved").inner_text()
+    mark(page, "moved").filter(has_text=f"{source} to robot-").wait_for()
     page.get_by_text("1 move,").wait_for()
 
 

@@ -52,7 +52,7 @@ def cell(found: Any) -> Any:
 def test_the_tree_opens_closes_and_finds(page):
     """Click, keys and search work; a group shows sums of its processes, also while closed."""
     nav = group(page, "nav", is_open=True)
-    assert "failed" in nav.inner_text()
+    nav.filter(has_text="failed").wait_for()
     assert nav.get_attribute("aria-level") == "1"
     assert row(page, "left.camera").get_attribute("aria-level") == "3"
 

@@ -17,7 +17,7 @@ from rosrm_launch.model import LaunchModel
 from rosrm_launch.translate import translated
 from tests.launch_files import make_package, stored
 from tests.ros.clusters import NODE
-from tests.waiting import wait_until
+from tests.waiting import command_of, wait_until
 
 ROSRM = str(Path(sys.executable).parent / "rosrm")
 #: Seconds allowed on a busy machine; no wait takes so long unless a test fails.
@@ -179,14 +179,10 @@ def test_a_slave_beside_the_quota_of_its_jobs(cluster):
     )
     limits = cluster.ask("logs", "group")
     assert f":{lab.group('host1')}/rosrm-state-" in limits  # its own group, below the limited one
-    inner = [pid for pid in lab.pids("host1") if "rosrm.slave" in _command(pid)]
+    inner = [pid for pid in lab.pids("host1") if "rosrm.slave" in command_of(pid)]
     assert inner
     assert lab.group("host1") not in Path(f"/proc/{inner[0]}/cgroup").read_text()
     assert slave.poll() is None
-
-
-def _command(pid: int) -> str:
-    return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode()
 
 
 @pytest.mark.timeout(300)

@@ -21,7 +21,7 @@ from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 from rosrm.supervisor import descriptors, instance_record, messages, procfs
 from rosrm.supervisor.client import SupervisorClient, SupervisorEnded
 from rosrm.supervisor.messages import Forget
-from tests.waiting import command_of, wait_gone, wait_until
+from tests.waiting import PATIENCE, command_of, wait_gone, wait_until
 
 from .conftest import Host, kill
 
@@ -386,10 +386,10 @@ def test_a_lost_supervisor_is_reported(host, client):
 def test_orders_pass_while_another_thread_waits(host, client):
     """While one thread blocks in `receive`, another can send orders; the answer wakes the first."""
     received = []
-    thread = threading.Thread(target=lambda: received.extend(client.receive(10)))
+    thread = threading.Thread(target=lambda: received.extend(client.receive(PATIENCE)))
     thread.start()
     client.start([host.order("job", "true")])
-    thread.join(10)
+    thread.join(PATIENCE)
     assert received
 
 

@@ -17,6 +17,7 @@ from rosrm.extensions.made import OfferedExecutor
 from rosrm.extensions.plugin_calls import WORKS_AFTER
 from rosrm.slave.executors import Executors
 from rosrm.testing import FakeClock
+from tests.waiting import PATIENCE
 
 HERE = {"host": "alpha"}
 
@@ -35,7 +36,7 @@ class Rig:
         """Run the executor until it calls the loop back; return the settled results."""
         outcomes = []
         self.executors.execute("wait", {}, timeout, here=HERE, done=outcomes.append)
-        self.posted.get(timeout=10.0)()
+        self.posted.get(timeout=PATIENCE)()
         return outcomes
 
 

@@ -22,6 +22,7 @@ from rosrm.supervisor import endpoint, instance_record, messages, procfs, spawn
 from rosrm.supervisor.json_lines import ProtocolError, line
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.server import LONGEST_WAIT, Server
+from tests.waiting import PATIENCE
 
 TEN_YEARS = 10 * 365.25 * 86400.0
 RESTART = ["always", 1.0, 30.0, 2.0, 5, 300.0]
@@ -209,7 +210,7 @@ def test_a_process_that_cannot_exist_is_refused_alone(server, order):
     ours, peer = socket.socketpair()
     with peer:
         talk(one, ours, peer, order)
-        deadline = time.monotonic() + 5.0
+        deadline = time.monotonic() + PATIENCE
         while not (ended := [i for i in one._core.instances.values() if i.phase != "starting"]):
             assert time.monotonic() < deadline
             one._round()
