@@ -74,7 +74,6 @@ if TYPE_CHECKING:
         SkipPlugin,
     )
     from rosrm.extensions.contracts import (
-        BoolArray,
         Capabilities,
         CheckpointChoice,
         CheckpointOffer,
@@ -82,7 +81,6 @@ if TYPE_CHECKING:
         CheckpointView,
         DeviceFinding,
         FilterOffer,
-        FloatArray,
         GraphDepartureLauncher,
         HostChecking,
         HostLabelling,
@@ -113,7 +111,7 @@ if TYPE_CHECKING:
         SpecChecking,
     )
     from rosrm.extensions.hookspecs import hookimpl
-    from rosrm.extensions.link_views import FlowView, LinkView
+    from rosrm.extensions.link_views import BoolArray, FloatArray, FlowView, LinkView
     from rosrm.extensions.options import options_of
     from rosrm.extensions.sinks import EventSink, NoticesRefused, SinkOffer
     from rosrm.extensions.units import (
@@ -219,15 +217,15 @@ _NAMES: Final = {
     "config.work": "load_work",
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
     "extensions.contracts": (
-        "BoolArray Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
-        "DeviceFinding FilterOffer FloatArray GraphDepartureLauncher HostChecking HostLabelling "
+        "Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
+        "DeviceFinding FilterOffer GraphDepartureLauncher HostChecking HostLabelling "
         "HostView ImageLauncher Imaging Launch Launcher LauncherContext LauncherOffer "
         "MemoryPacing MemoryView MigrationOffer MigrationStrategy NoOptions PeriodicImaging "
         "PlacementFilter Probe ProbeContext ProbeOffer ProcessMeasuring ProcessTreeLauncher "
         "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
-    "extensions.link_views": "FlowView LinkView",
+    "extensions.link_views": "BoolArray FloatArray FlowView LinkView",
     "extensions.options": "options_of",
     "extensions.sinks": "EventSink NoticesRefused SinkOffer",
     "extensions.units": (

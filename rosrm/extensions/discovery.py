@@ -12,7 +12,7 @@ import logging
 import re
 import sys
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
 from pkgutil import resolve_name
@@ -111,12 +111,18 @@ class Loaded:
     broken: list[Broken]
 
 
-def load_addresses(addresses: Iterable[PluginAddress]) -> Loaded:
-    """Load every plugin of an installation."""
+def load_addresses(
+    addresses: Iterable[PluginAddress], kinds: Collection[PluginKind] | None = None
+) -> Loaded:
+    """Load every plugin of an installation.
+
+    Args:
+        kinds: of the offers that are needed; None: all. No hook of another kind is called.
+    """
     loaded = Loaded([], [])
     for address in addresses:
         source = PluginSource(address.name, address.distribution)
-        _load(loaded, source, address.target, partial(resolve_name, address.target))
+        _load(loaded, source, address.target, partial(resolve_name, address.target), kinds)
     return loaded
 
 
@@ -162,7 +168,10 @@ def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
         timer.cancel()
 
 
-def _load(loaded: Loaded, source: PluginSource, target: str, load: Callable[[], object]) -> None:
+def _load(
+    loaded: Loaded, source: PluginSource, target: str, load: Callable[[], object],
+    kinds: Collection[PluginKind] | None = None,
+) -> None:  # fmt: skip
     try:
         plugin = _in_time(source, f"the import of {target}", load)
         marked = _marked(plugin)
@@ -171,8 +180,8 @@ def _load(loaded: Loaded, source: PluginSource, target: str, load: Callable[[], 
         return
     for reason in _misspelt(plugin, marked):
         loaded.broken.append(Broken(source, reason))
-    for hook in HOOKS:
-        if hook in marked:
+    for hook, (kind, _) in HOOKS.items():
+        if hook in marked and (kinds is None or kind in kinds):
             _take(loaded, source, hook, marked[hook])
 
 

@@ -1,17 +1,24 @@
-"""Links and flows as scoring policies read them: arrays over hosts, with NaN where not measured."""
+"""Links and flows as scoring policies read them: arrays over hosts, with NaN where not measured.
+
+Slaves and commands import this module. So numpy is imported only where an array is made.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Final, Protocol
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Protocol, TypeAlias
 
-import numpy as np
-import numpy.typing as npt
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
+#: Numpy array of 64-bit floats.
+FloatArray: TypeAlias = "npt.NDArray[np.float64]"
+#: Numpy array of booleans.
+BoolArray: TypeAlias = "npt.NDArray[np.bool_]"
 
 
 class LinkView(Protocol):
@@ -36,14 +43,19 @@ class LinkView(Protocol):
 
 @dataclass(frozen=True)
 class MeasuredLinks:
-    """`LinkView` with given arrays, by default of no host, for views that are made by hand."""
+    """`LinkView` with given arrays, for views that are made by hand."""
 
-    hosts: Sequence[str] = ()
-    round_trip: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
-    rate: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
+    hosts: Sequence[str]
+    round_trip: FloatArray
+    rate: FloatArray
 
 
-NO_LINKS: Final = MeasuredLinks()
+@cache
+def no_links() -> LinkView:
+    """Return the links of no host."""
+    import numpy as np  # noqa: PLC0415 - see above
+
+    return MeasuredLinks((), np.zeros((0, 0)), np.zeros((0, 0)))
 
 
 @dataclass(frozen=True)
@@ -109,8 +121,12 @@ def _per_second(rate: float) -> str:
     return f"{rate:.3g} B/s"
 
 
-#: No flows on no host; its sums over flows are 0 for any number of hosts.
-NO_FLOWS: Final = FlowView(
-    (), (), np.zeros(0), np.zeros(0, np.bool_), np.zeros((1, 0), np.bool_),
-    *(np.zeros((1, 0)) for _ in range(5)),
-)  # fmt: skip
+@cache
+def no_flows() -> FlowView:
+    """Return no flows on no host; sums over them are 0 for any number of hosts."""
+    import numpy as np  # noqa: PLC0415 - see above
+
+    return FlowView(
+        (), (), np.zeros(0), np.zeros(0, np.bool_), np.zeros((1, 0), np.bool_),
+        *(np.zeros((1, 0)) for _ in range(5)),
+    )  # fmt: skip

@@ -7,7 +7,7 @@ checked options; `rosrm.config.options` checks the options in a file against the
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache, partial
 from typing import Any, Final, TypeVar, cast
 
@@ -79,6 +79,9 @@ _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "sink": "rosrm-alerts",
 }
 
+#: Kinds of the plugins that slaves use.
+SLAVE_KINDS: Final[tuple[PluginKind, ...]] = ("probe", "migration", "launcher")
+
 #: Time-out of `create` in seconds; it may load a large library.
 CREATE_LIMIT: Final = 30.0
 
@@ -110,9 +113,15 @@ class Registry:
         return cls.load(installed_plugins())
 
     @classmethod
-    def load(cls, addresses: Iterable[PluginAddress]) -> Registry:
-        """Load plugins at known addresses, as `discover` does."""
-        return cls(load_addresses(addresses))
+    def load(
+        cls, addresses: Iterable[PluginAddress], kinds: Collection[PluginKind] | None = None
+    ) -> Registry:
+        """Load plugins at known addresses, as `discover` does.
+
+        Args:
+            kinds: those whose offers are needed; None: all. No hook of another kind is called.
+        """
+        return cls(load_addresses(addresses, kinds))
 
     @classmethod
     def of(cls, **plugins: object) -> Registry:

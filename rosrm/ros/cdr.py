@@ -34,7 +34,7 @@ _ALIGNMENT: Final = 8
 #: Forms of one nested message that are kept for each alignment, and most bytes of one.
 _KEPT: Final = 4
 _MOST_BYTES: Final = 512
-#: Code for `struct` and `array` of each type of numbers.
+#: Code for `struct` and `array` of each type of numbers. No message has an array of fixed length.
 _CODES: Final = {
     "boolean": "?", "octet": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",
     "uint32": "I", "int32": "i", "uint64": "Q", "int64": "q", "float": "f", "double": "d",
@@ -247,9 +247,6 @@ def _writer(declared: str) -> _Writer:
         return _write_text
     if declared.startswith("sequence<"):
         return _sequence_writer(declared.removeprefix("sequence<").removesuffix(">"))
-    if declared.endswith("]"):
-        inner, _, _count = declared.removesuffix("]").partition("[")
-        return _numbers_writer(_CODES[inner])
     if declared in _CODES:
         return _number_writer(_CODES[declared])
     return _remembering(_message_writer(_kind(declared)))
@@ -322,7 +319,7 @@ def _write_count(count: int, parts: list[bytes], at: int) -> int:
 
 
 def _numbers_writer(code: str) -> _Writer:
-    """Return the writer of numbers without their count: an array of fixed length, or a sequence."""
+    """Return the writer of numbers without their count."""
     size = struct.calcsize(f"<{code}")
 
     def write_numbers(numbers: Any, parts: list[bytes], at: int) -> int:

@@ -16,7 +16,7 @@ import logging
 import sys
 
 from rosrm.config.settings import HostConfig
-from rosrm.extensions.registry import Registry
+from rosrm.extensions.registry import SLAVE_KINDS, Registry
 from rosrm.runtime import cgroups, oom_score
 from rosrm.runtime.bootstrap import Handover, run
 from rosrm.slave.own_key import wait_for_security
@@ -28,7 +28,7 @@ _log = logging.getLogger("rosrm.slave")
 def serve(handover: Handover) -> int:
     """Load the plugins and run the slave; return the exit code."""
     config = HostConfig.from_json(handover.settings)
-    registry = Registry.load(handover.plugins)
+    registry = Registry.load(handover.plugins, SLAVE_KINDS)
     fault = oom_score.protect()
     if fault:
         _log.info(

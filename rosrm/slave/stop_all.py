@@ -15,7 +15,7 @@ import sys
 from dataclasses import replace
 
 from rosrm.config.settings import HostConfig
-from rosrm.extensions.registry import Registry
+from rosrm.extensions.registry import SLAVE_KINDS, Registry
 from rosrm.keys.finding import host_security
 from rosrm.runtime.bootstrap import Handover, run
 from rosrm.slave.own_key import security_without_key
@@ -29,7 +29,7 @@ def serve(handover: Handover) -> int:
     ending = replace(config, on_stop="stop", probes={})
     host = config.host
     security = host_security(config.security, host) or security_without_key(host)
-    registry = Registry.load(handover.plugins)
+    registry = Registry.load(handover.plugins, SLAVE_KINDS)
     return SlaveRuntime(ending, registry, security, handover.source).stop_all()
 
 

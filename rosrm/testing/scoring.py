@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from rosrm.core.master.scheduling.host_views import checked_scores
 from rosrm.extensions.contracts import (
-    BoolArray,
     HostView,
     ProcessView,
     Scores,
@@ -21,7 +20,7 @@ from rosrm.extensions.contracts import (
     ScoringPolicy,
 )
 from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_spec
-from rosrm.extensions.link_views import NO_FLOWS, FlowView
+from rosrm.extensions.link_views import BoolArray, FlowView, no_flows
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.devices import DeviceNeed
@@ -71,7 +70,7 @@ def process_view(
     hosts: HostView,
     needs: Mapping[str, float] = EMPTY,
     *,
-    flows: FlowView = NO_FLOWS,
+    flows: FlowView | None = None,
     reads: tuple[str, ...] = SPEC_FIELDS,
     **spec: Any,
 ) -> ProcessView:
@@ -80,7 +79,7 @@ def process_view(
     Args:
         hosts: candidates for the placement.
         needs: base units by resource.
-        flows: with other processes, see `flow_view`.
+        flows: with other processes, see `flow_view`; None: there are none.
         reads: fields of the spec that the policy's offer declares; the default is all of them.
         spec: fields of the spec, e.g. `name="camera_0"` or `environment={"GROUP": "camera"}`.
     """
@@ -91,7 +90,7 @@ def process_view(
             row = hosts.resources.index(name)
             part = amount / hosts.capacity[:, row]
             need[row] = np.where(np.isnan(part), np.inf if amount > 0 else 0.0, part)
-    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T, flows)
+    return ProcessView(declared_spec(ProcessSpec(**fields), reads), need.T, flows or no_flows())
 
 
 def flow_view(

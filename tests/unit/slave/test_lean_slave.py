@@ -7,7 +7,7 @@ from rosrm.extensions.installed import installed_plugins
 
 #: Modules that a slave without processes does not need, largest first.
 NOT_NEEDED = (
-    "pydantic", "rich", "typer", "lark", "psutil", "asyncio", "multiprocessing", "sqlite3",
+    "numpy", "pydantic", "rich", "typer", "lark", "psutil", "asyncio", "multiprocessing", "sqlite3",
     "urllib.request", "http.client", "email", "ssl", "statistics", "decimal", "argparse",
     "rosrm.master", "rosrm.ros.master", "rosrm.core.master.events",
 )  # fmt: skip
@@ -17,9 +17,9 @@ from pathlib import Path
 import rosrm.slave.__main__
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.installed import PluginAddress
-from rosrm.extensions.registry import Registry
+from rosrm.extensions.registry import SLAVE_KINDS, Registry
 
-registry = Registry.load({installed_plugins()})
+registry = Registry.load({installed_plugins()}, SLAVE_KINDS)
 registry.probes(None, ProbeContext("machine", {{}}, Path("/"), None))
 registry.launchers(LauncherContext(Path("/nowhere"), sys.executable, 1))
 print(*[name for name in {NOT_NEEDED} if name in sys.modules])

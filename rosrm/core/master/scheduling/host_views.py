@@ -16,7 +16,7 @@ from rosrm.core.master.state.links import LinkTable
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_spec
-from rosrm.extensions.link_views import NO_FLOWS
+from rosrm.extensions.link_views import no_flows
 from rosrm.extensions.plugin_calls import given, required
 from rosrm.model.values import ProcessSpec
 
@@ -51,7 +51,7 @@ def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
     """
     spec = declared_spec(hosts.demand.spec, reads)
     has_flows = FLOWS_FIELD in reads and hosts.demand.traffic.flows
-    flows = hosts.flows() if has_flows else NO_FLOWS
+    flows = hosts.flows() if has_flows else no_flows()
     return ProcessView(spec, _read_only(hosts.need.T), flows)
 
 
