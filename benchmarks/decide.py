@@ -9,6 +9,8 @@ master's runtime, without the transport and the journal:
   readings. `over_floor`: the time of the decision over that of a floor (`floor_us`), by turns in
   one run: one numpy pass over the same arrays, with the needs as shares of each capacity, the test
   of the limits, the weighted sum and one argmin; nothing is checked, recorded or accounted.
+  `search_over_floor`: the same for the part of the decision that does what the floor does, from the
+  demand to the best host; the rest is the submission, its records and its reservation.
 - `assignments_per_s`: many processes are submitted at once; from SubmissionReceived to the
   commands, with the queue, the record and the intent of each. `assignments_per_s` is for equal
   processes, `mixed_assignments_per_s` for ten different demands by turns (such as the pieces of a
@@ -38,10 +40,12 @@ import numpy as np
 from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
 from rosrm.core.master import events as happened
+from rosrm.core.master.assignment.demands import ranking_of
 from rosrm.core.master.commands import Assign
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.master.settings import CoreSettings
+from rosrm.core.master.state.demand import Demand
 from rosrm.extensions.placement import PlacementPlugins, ScoringLink
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.links import Interface
@@ -145,33 +149,50 @@ class Bench:
         np.where(fits, weights @ table.busy, np.inf).argmin()
         return time.perf_counter() - began
 
+    def search(self) -> float:
+        """Return the seconds of the choice of a host for `equal`, without its assignment."""
+        spec = equal(0)
+        demand = Demand(spec, spec.needs, plugins=self.state.placement)
+        began = time.perf_counter()
+        found = ranking_of(self.state, demand).best()
+        took = time.perf_counter() - began
+        assert found >= 0
+        return took
+
     def submit(self, specs: Sequence[ProcessSpec]) -> tuple[float, int]:
         """Submit processes at once; return as `step`."""
         return self.step(happened.SubmissionReceived(1, tuple(specs)))
 
 
 class Timed(NamedTuple):
-    """Median microseconds of a decision, its readings and the floor; median ratio of the two."""
+    """Median microseconds of a decision, its readings and the floor; median ratios to the floor."""
 
     decision: float
     readings: float
     floor: float
     over_floor: float
+    search_over_floor: float
 
 
 def decision(hosts: int, runs: int) -> Timed:
     """Time single decisions after fresh readings, by turns with the floor."""
     bench = Bench(hosts)
-    decisions, readings, floors = [], [], []
+    decisions, readings, floors, searches = [], [], [], []
     for number in range(runs):
+        bench.read()
+        bench.floor()  # as before the decision, so that both find the arrays in the same caches
+        searches.append(bench.search())
         readings.append(bench.read())
         floors.append(bench.floor())
         seconds, assigned = bench.submit([equal(number)])
         assert assigned == 1
         decisions.append(seconds)
-    ratios = [both[0] / both[1] for both in zip(decisions, floors, strict=True)]
+    over, search_over = (
+        median(one / floor for one, floor in zip(times, floors, strict=True))
+        for times in (decisions, searches)
+    )
     took, read, floor = (1e6 * median(one) for one in (decisions, readings, floors))
-    return Timed(took, read, floor, median(ratios))
+    return Timed(took, read, floor, over, search_over)
 
 
 def rate(hosts: int, runs: int, spec_of: SpecOf, count: int = _AT_ONCE) -> float:
@@ -263,14 +284,16 @@ def main() -> None:
     command_line.add_argument("--runs", type=int, default=7, help="measurements of each figure")
     runs = command_line.parse_args().runs
     per_host, read, rates, mixed_rates = {}, {}, {}, {}
-    floor_us, over_floor, rate_of_floor = {}, {}, {}
+    floor_us, over_floor, search_over_floor, rate_of_floor = {}, {}, {}, {}
     for hosts in _HOSTS:
-        us, readings, floor, over = decision(hosts, 20 * runs)
+        us, readings, floor, over, search_over = decision(hosts, 20 * runs)
         per_host[str(hosts)], read[str(hosts)] = round(us / hosts, 4), round(readings / hosts, 4)
         floor_us[str(hosts)], over_floor[str(hosts)] = round(floor, 1), round(over, 2)
+        search_over_floor[str(hosts)] = round(search_over, 2)
         say(
             f"{hosts:6} hosts: {us / hosts:.4f} us a host for a decision, {over:.2f} times the "
-            f"floor of {floor:.1f} us; {readings / hosts:.4f} us for its readings"
+            f"floor of {floor:.1f} us, its search {search_over:.2f} times; "
+            f"{readings / hosts:.4f} us for its readings"
         )
     for hosts in _HOSTS:
         rates[str(hosts)] = round(rate(hosts, runs, equal))
@@ -282,6 +305,7 @@ def main() -> None:
         say(f"{name:12}: {figure['assignments_per_s']} a second, {figure['times']} times as long")
     figures = {
         "us_per_host": per_host, "floor_us": floor_us, "over_floor": over_floor,
+        "search_over_floor": search_over_floor,
         "assignments_per_s": rates, "rate_of_floor": rate_of_floor,
         "mixed_assignments_per_s": mixed_rates, "readings_us_per_host": read,
         "constrained": with_rules,

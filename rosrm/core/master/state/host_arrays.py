@@ -51,7 +51,7 @@ class HostColumns:
         registered: (H,) time of the registration.
         period: (H,) seconds between two readings.
         processes: (H,) number of processes on the host or reserved for it.
-        ties: (H,) `TIE` for each of them.
+        ties: (H,) `TIE` times `processes`.
         bound: (H,) highest number of processes.
         incarnation: (H,) incarnation of the slave.
         sequence: (H,) sequence of the newest reading.
