@@ -488,7 +488,7 @@ class SlaveRuntime:
         self._links.measure(order, done)
 
     def _look_at_flows(self) -> None:
-        nodes = self._state.nodes() if self._learns else {}
+        nodes = self._state.ready_nodes() if self._learns else {}
         self._participant.guard.call(self._flows.look, nodes)
 
     # --- core and supervisor -------------------------------------------------------------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from itertools import islice
 from types import MappingProxyType
 from typing import Any, Final
 
@@ -70,7 +71,7 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
         state.hold(instance, _waiting(assignment))
     launches = _start_waiting(state, now)
     held = [state.held[one.instance] for one in event.assignments if one.instance in state.waiting]
-    why = state.why_wait()
+    why = state.why_wait() if held else ""
     for one in held:
         one.status = replace(one.status, message=why)
     reports = refusals + [one.status for one in held]
@@ -112,10 +113,9 @@ def _waiting(assignment: Assignment) -> HeldInstance:
 def _start_waiting(state: SlaveState, now: float) -> _Commands:
     """Launch waiting instances within the bounds."""
     refused = _refuse_late(state, now)
-    launches = []
-    while state.waiting and not state.why_wait():
-        instance = next(iter(state.waiting))
-        launches.append(state.waiting.pop(instance))
+    started = tuple(islice(state.waiting, state.startable()))
+    launches = [state.waiting.pop(instance) for instance in started]
+    for instance in started:
         state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
     return [*([commands.Launch(tuple(launches))] if launches else []), *refused]
 

@@ -142,6 +142,8 @@ class SlaveState:
         renewed_at: time of the last `Renew` to the supervisor.
         held: all instances, including ended ones that may still be reported.
         alive: those of `held` that have not ended. Many ended ones would slow down each start.
+        nodes: those of `alive` whose node is awaited in the ROS graph. The loop of the slave looks
+            at them in each turn, and most jobs have no node.
         waiting: assignments that start as soon as the bounds allow, in order.
         tombstones: ended and refused instances, which never start on this host again.
     """
@@ -156,6 +158,7 @@ class SlaveState:
     renewed_at: float = 0.0
     held: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     alive: dict[InstanceId, HeldInstance] = field(default_factory=dict)
+    nodes: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
@@ -163,15 +166,21 @@ class SlaveState:
         """Add an instance, or note that its status is another one."""
         self.held[instance] = held
         if held.status.state.ended:
-            self.alive.pop(instance, None)
-        else:
-            self.alive[instance] = held
+            self._bury(instance)
+            return held
+        self.alive[instance] = held
+        if held.awaited is not None:
+            self.nodes[instance] = held
         return held
 
     def drop(self, instance: InstanceId) -> HeldInstance:
         """Forget an instance, and return it."""
-        self.alive.pop(instance, None)
+        self._bury(instance)
         return self.held.pop(instance)
+
+    def _bury(self, instance: InstanceId) -> None:
+        self.alive.pop(instance, None)
+        self.nodes.pop(instance, None)
 
     def used_artifacts(self) -> list[tuple[Artifact, ...]]:
         """Return the artifacts of each instance that has not ended."""
@@ -179,13 +188,13 @@ class SlaveState:
 
     def awaited_in_graph(self) -> Mapping[InstanceId, HeldInstance]:
         """Return the instances that become ready when their node appears in the ROS graph."""
-        return {one: held for one, held in self.alive.items() if held.ready_by is not None}
+        return {one: held for one, held in self.nodes.items() if held.ready_by is not None}
 
-    def nodes(self) -> Mapping[int, str]:
+    def ready_nodes(self) -> Mapping[int, str]:
         """Return the number of each ready instance with a node to the node's full name."""
         return {
             instance.number: held.awaited.node_name
-            for instance, held in self.alive.items()
+            for instance, held in self.nodes.items()
             if held.awaited is not None and held.status.state is InstanceState.READY
         }
 
@@ -206,17 +215,23 @@ class SlaveState:
             for status in statuses
         )
 
-    def has_slot(self) -> bool:
-        """Return True if one more process may run."""
-        return not self.max_processes or self.live() - len(self.waiting) < self.max_processes
+    def slots(self) -> int:
+        """Return the number of waiting instances that may run beside the others."""
+        waiting = len(self.waiting)
+        return self.max_processes - (self.live() - waiting) if self.max_processes else waiting
+
+    def startable(self) -> int:
+        """Return the number of waiting instances that may start now."""
+        most = min(len(self.waiting), self.slots())
+        if most > 0 and self.max_starting:
+            most = min(most, self.max_starting - self.starting())
+        return max(0, most)
 
     def why_wait(self) -> str:
-        """Return why a further instance must wait for its start; "" if it need not."""
-        if not self.has_slot():
+        """Return why the waiting instances must wait; call this when no more of them may start."""
+        if self.slots() <= 0:
             return "waits for a free slot there"
-        if self.max_starting and self.starting() >= self.max_starting:
-            return f"waits until others there have started (max_starting: {self.max_starting})"
-        return ""
+        return f"waits until others there have started (max_starting: {self.max_starting})"
 
     def starting(self) -> int:
         """Return the number of instances being started, or running and not ready yet."""
