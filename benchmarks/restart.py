@@ -25,9 +25,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.machine import isolated_transports, parser, print_report, say
-from benchmarks.scale import Crowd, start_processes
+from benchmarks.scale import Crowd, occupied_cluster
+from benchmarks.simulated_slaves import STEP
 from benchmarks.stopping import run
-from rosrm.config.settings import ClusterConfig, ProcessDefaults
+from rosrm.config.settings import ProcessDefaults
 from rosrm.errors import RosrmError
 from rosrm.model.values import Kind, ProcessSpec
 from rosrm.ros.master_connection import MasterClient
@@ -123,15 +124,9 @@ def _wait_for_ends(client: MasterClient, jobs: set[str]) -> None:
 def measure(arguments: argparse.Namespace, folder: Path) -> list[dict[str, float]]:
     """Return the times of all rounds; raises `RosrmError` if a part ends or a host gets no job."""
     with ExitStack() as opened:
-        cluster = LocalCluster(folder, ClusterConfig())
-        opened.callback(cluster.close)
-        assert cluster.domain is not None
-        cluster.start_master()
-        cluster.client.list()
-        crowd = Crowd(cluster.domain, 10.0, 0.005, _PATIENCE)
-        opened.callback(crowd.close)
-        crowd.start(arguments.hosts, 1)
-        start_processes(cluster, arguments.processes, _PATIENCE)
+        cluster, crowd = occupied_cluster(
+            opened, folder, arguments.hosts, arguments.processes, STEP, _PATIENCE
+        )
         cluster.client.spin(_SETTLED)
         rounds = []
         for number in range(arguments.runs):

@@ -199,7 +199,24 @@ def _ended(process: subprocess.Popen[str]) -> RosrmError:
     return RosrmError(f"simulated slaves ended with exit code {process.wait(_END)}; see above")
 
 
-def start_processes(cluster: LocalCluster, count: int, timeout: float) -> None:
+def occupied_cluster(
+    opened: ExitStack, folder: Path, hosts: int, processes: int, step: float, timeout: float
+) -> tuple[LocalCluster, Crowd]:
+    """Return a cluster of simulated hosts with running services; `opened` closes both."""
+    cluster = LocalCluster(folder, ClusterConfig())
+    opened.callback(cluster.close)
+    assert cluster.domain is not None
+    cluster.start_master()
+    cluster.client.list()
+    crowd = Crowd(cluster.domain, 10.0, step, timeout)
+    opened.callback(crowd.close)
+    crowd.start(hosts, 1)
+    _start_processes(cluster, processes, timeout)
+    say(f"{hosts} hosts, {processes} processes")
+    return cluster, crowd
+
+
+def _start_processes(cluster: LocalCluster, count: int, timeout: float) -> None:
     """Submit so many services, and wait until all of them are placed."""
     names = [f"process_{number}" for number in range(count)]
     for start in range(0, count, _AT_ONCE):  # a busy machine needs longer for all of them

@@ -33,11 +33,10 @@ import psutil
 from playwright.sync_api import Browser, Page
 
 from benchmarks.browser import browser
-from benchmarks.machine import parser, print_report, say
-from benchmarks.scale import Crowd, start_processes
+from benchmarks.machine import parser, print_report
+from benchmarks.scale import occupied_cluster
 from benchmarks.slave_cost import pss_mib
 from benchmarks.stopping import run
-from rosrm.config.settings import ClusterConfig
 from rosrm.errors import RosrmError
 from rosrm.testing.local_cluster import LocalCluster
 
@@ -148,16 +147,9 @@ def in_browser(cluster: LocalCluster, chromium: Browser, url: str) -> tuple[Page
 def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, float]:
     """Return all figures of one run; raises `RosrmError` if a part ends or does not answer."""
     with ExitStack() as opened:
-        cluster = LocalCluster(folder, ClusterConfig())
-        opened.callback(cluster.close)
-        assert cluster.domain is not None
-        cluster.start_master()
-        cluster.client.list()
-        crowd = Crowd(cluster.domain, 10.0, 0.0, _PATIENCE)
-        opened.callback(crowd.close)
-        crowd.start(arguments.hosts, 1)
-        start_processes(cluster, arguments.processes, _PATIENCE)
-        say(f"{arguments.hosts} hosts, {arguments.processes} processes")
+        cluster, _ = occupied_cluster(
+            opened, folder, arguments.hosts, arguments.processes, 0.0, _PATIENCE
+        )
         process, port = opened.enter_context(gateway(cluster))
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=_PATIENCE)
         opened.callback(connection.close)

@@ -160,7 +160,7 @@ class MasterRuntime:
             self._endpoints = SealedEndpoints(self._participant, security)
             self._grants = GrantsWatch(security)
             last = self._last_run()
-            # Meanwhile, DDS discovers another master, if there is one.
+            # During the restore DDS discovers another master, if there is one.
             self._state = self._restored(placement, strategies, last, joined)
             self._refuse_second(max(_ANSWER, joined + _DISCOVERY - self._now()))
             self._behind = self._now() - joined  # no host could report in that time
