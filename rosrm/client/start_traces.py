@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
@@ -43,8 +43,10 @@ BESIDE: Final[dict[str, str]] = {
 _EVENTS: Final = STAMPS | BESIDE
 #: Digits of a unix time in nanoseconds.
 _DIGITS: Final = 19
-#: Bytes at the beginning of a log in which the stamps are looked for.
-_BEGINNING: Final = 1 << 16
+#: Bytes of a log that one request reads.
+_PART: Final = 1 << 16
+#: Bytes at the beginning of a log in which the stamps are looked for: the process may write first.
+_BEGINNING: Final = 1 << 22
 #: Seconds between two requests. The first follows after them, so that it delays no start.
 _PERIOD: Final = 0.1
 #: Seconds after its start for which the stamp of a process itself is awaited.
@@ -100,6 +102,8 @@ def stamps_in_log(lines: Iterable[str]) -> dict[str, int]:
                     stamps.setdefault(name, int(at))
         elif not own and _is_time(line):
             own = int(line)
+        if stamps and own:  # the rest of a long log need not be read
+            break
     return {**stamps, "process_started": own} if stamps and own else stamps
 
 
@@ -168,13 +172,23 @@ class _Reader:
 
     def _in_log(self, row: ProcessRow) -> Trace:
         """Return the stamps in the log; {}: there is no log, or it has another trace."""
-        if not row.host:
-            return {}
-        try:
-            part = self.master.read_log(row.host, self.process, row.number, 0, _BEGINNING)
-        except Refused as refusal:
-            if refusal.code != "unknown":  # its host has not created the log yet
-                raise
-            return {}
-        stamps = stamps_in_log(part.content.decode(errors="replace").splitlines())
+        lines = (line.decode(errors="replace") for line in self._lines(row))
+        stamps = stamps_in_log(lines) if row.host else {}
         return stamps if stamps.get("client_sent") == self.sent else {}
+
+    def _lines(self, row: ProcessRow) -> Iterator[bytes]:
+        """Yield the lines at the beginning of the log; none if there is no log."""
+        offset, rest = 0, b""
+        while offset < _BEGINNING:
+            try:
+                part = self.master.read_log(row.host, self.process, row.number, offset, _PART)
+            except Refused as refusal:
+                if refusal.code != "unknown":  # its host has not created the log yet
+                    raise
+                return
+            *lines, rest = (rest + part.content).split(b"\n")
+            yield from lines
+            offset = part.next_offset
+            if len(part.content) < _PART:  # all that there is now
+                break
+        yield rest

@@ -79,10 +79,10 @@ class Master:
     def list(self, **_) -> Listing:
         return Listing("m", 1.0, 1, processes=(self.row,))
 
-    def read_log(self, *_) -> LogPart:
+    def read_log(self, _host, _process, _number, offset, size) -> LogPart:
         sent = self.submitted[0].environment[VARIABLE]
-        text = self.log.format(sent=sent).encode()
-        return LogPart(1, (1,), text, 0, len(text), False, ())
+        part = self.log.format(sent=sent).encode()[offset : offset + size]
+        return LogPart(1, (1,), part, offset, offset + len(part), False, ())
 
 
 @pytest.fixture(autouse=True)
@@ -103,6 +103,13 @@ def test_a_traced_submission_returns_the_trace_of_this_start() -> None:
     assert master.submitted[0].environment["A"] == "b"
     assert list(trace) == ["client_sent", "decided", "client_answered"]
     assert trace["client_sent"] <= trace["client_answered"]
+
+
+def test_a_process_may_write_much_before_its_trace() -> None:
+    """The process runs before the supervisor writes the trace to its log."""
+    noise = 12_345 * "loading a map\n"
+    master = Master(process("p"), f"{noise}{LINE}{{sent}} decided={OWN}\n{noise}{OWN}\n")
+    assert traced(master)["p"]["process_started"] == OWN
 
 
 @pytest.mark.parametrize(
