@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 #: Seconds between two requests to the master.
 PERIOD: Final = 0.1
+#: Seconds; two events of one sequence with times closer than this are one event.
+_SAME: Final = 0.001
 #: Most new events of one request; if there are more, the oldest are left out.
 MOST_EVENTS: Final = 1000
 #: Seconds without an answer after which the master counts as lost.
@@ -65,6 +67,7 @@ class Watcher:
     def __init__(self, link: MasterLink) -> None:
         self._link = link
         self._after = -1
+        self._written = 0.0  # unix time of the event with this sequence; 0: unknown
         self.master = MasterState()
         self.load: Mapping[str, float] = {}
         self.on_master: list[Callable[[MasterState], None]] = []
@@ -89,25 +92,32 @@ class Watcher:
             self._set_master(MasterState(state, str(error)))
             raise
         self._set_master(MasterState("up", ""))
-        if listing.last_sequence < self._after:
+        events = listing.events
+        has_last = bool(events) and events[0].sequence == self._after
+        if listing.last_sequence < self._after or (has_last and self._is_other(events[0])):
             self._after = 0  # the next request has the first events of the new journal
             for forget in self.on_new_journal:
                 forget()
             return
         self._after = listing.last_sequence
-        for call in self.on_events if listing.events else ():
+        self._written = events[-1].wall_time if events else 0.0
+        news = events[has_last:]
+        for call in self.on_events if news else ():
             try:
-                call(listing.events)
+                call(news)
             except Exception:  # noqa: BLE001 - one reader must not stop the others, or the watcher
                 _log.exception("a part of the gateway cannot read new events")
+
+    def _is_other(self, event: EventRow) -> bool:
+        """Return True if the last known event differs, because a new journal has overtaken it."""
+        return self._written > 0.0 and abs(event.wall_time - self._written) > _SAME
 
     def _list(self, client: Client) -> Listing:
         self.load = client.master_load()
         if self._after < 0:  # the events before the first request are no changes
             return client.list(on_wait=give_up_early)
-        return client.list(
-            events=True, after=self._after, newest=MOST_EVENTS, on_wait=give_up_early
-        )
+        after = max(self._after - 1, 0)  # with the last known event, which identifies the journal
+        return client.list(events=True, after=after, newest=MOST_EVENTS, on_wait=give_up_early)
 
     def _set_master(self, master: MasterState) -> None:
         is_new = master.state != self.master.state

@@ -56,6 +56,43 @@ def test_a_reader_of_events_that_fails_stops_neither_the_others_nor_the_watcher(
     asyncio.run(scene())
 
 
+class Journal(Master):
+    """A client of a master whose events all have one time, that of the journal."""
+
+    def __init__(self) -> None:
+        self.began, self.newest = 1.7e9, 3
+
+    def list(self, after=0, **_):
+        """Return the events after a sequence."""
+        numbers = range(after + 1, self.newest + 1)
+        events = [EventRow(n, self.began, 1.0, "assigned", "p", "a", "") for n in numbers]
+        return Listing("m", 1.0, self.newest, events=events)
+
+
+def test_a_new_journal_that_has_overtaken_the_old_one_is_noticed():
+    """Its last sequence alone would hide it; all its events are new."""
+
+    async def scene() -> None:
+        journal = Journal()
+        gateway = Gateway(lambda _: journal)
+        watcher, seen, resets = gateway.watcher, [], []
+        watcher.on_events[:] = [lambda rows: seen.extend(row.sequence for row in rows)]
+        watcher.on_new_journal[:] = [lambda: resets.append(len(seen))]
+        await watcher.look()
+        seen.clear()
+        journal.newest = 4
+        for _ in range(2):
+            await watcher.look()
+        assert (seen, resets) == ([4], [])
+        journal.began, journal.newest = 1.8e9, 6
+        for _ in range(3):
+            await watcher.look()
+        assert (seen, resets) == ([4, 1, 2, 3, 4, 5, 6], [1])
+        gateway.close()
+
+    asyncio.run(scene())
+
+
 def test_a_gateway_with_too_many_requests_does_not_count_its_master_as_lost():
     """The watcher cannot ask then, which says nothing about the master."""
 
