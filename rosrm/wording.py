@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from typing import Final
@@ -162,12 +163,12 @@ def standing(state: str) -> str:
     return _STANDING.get(state, f"is {words(state)}")
 
 
-def standing_for(state: str, time: str) -> str:
+def standing_for(state: str, span: str) -> str:
     """Return a state and its duration: "has been unreachable for 2 min", "finished 2 min ago"."""
     verb, _, rest = standing(state).partition(" ")
     if verb == "is":
-        return f"has been {rest} for {time}"
-    return f"{rest if verb == 'has' else f'{verb} {rest}'} {time} ago"
+        return f"has been {rest} for {span}"
+    return f"{rest if verb == 'has' else f'{verb} {rest}'} {span} ago"
 
 
 def size(amount: float, *, binary: bool = False) -> str:
@@ -209,6 +210,11 @@ def duration(seconds: float) -> str:
         return f"{minutes} min"
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes} min" if hours < 48 else f"{hours // 24} d"
+
+
+def local_time(when: float) -> str:
+    """Return a unix time as date and time of this machine's time zone."""
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(when))
 
 
 def reload_summary(changed: Sequence[str], kept: Sequence[str]) -> str:

@@ -38,7 +38,7 @@ class RawDrive:
 
     Attributes:
         numbers: (S,) numbers of the scans that exist.
-        times: (S,) unix seconds.
+        times: (S,) unix time in seconds.
         truth: (S, 4, 4) poses of the scanner in the frame of its first scan, or None.
     """
 
@@ -98,7 +98,7 @@ def _number(file: Path) -> int:
 
 
 def _unix_time(line: str, path: Path) -> float:
-    """Turn '2011-09-26 13:02:25.951199337' (UTC, nanoseconds) into unix seconds."""
+    """Turn '2011-09-26 13:02:25.951199337' (UTC, nanoseconds) into unix time in seconds."""
     whole, _, fraction = line.strip().partition(".")
     try:
         moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=timezone.utc)

@@ -27,7 +27,7 @@ class ReceivedPose:
     """One pose that was published.
 
     Attributes:
-        arrived: When DDS received it, unix seconds.
+        arrived: When DDS received it, unix time in seconds.
         stamp: Of its scan, nanoseconds.
         pose: (4, 4).
     """

@@ -8,7 +8,6 @@ they order the output of a process.
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
@@ -18,7 +17,7 @@ from rosrm.client.connecting import check_name
 from rosrm.client.retrying import Notify
 from rosrm.client.waiting import ENDED
 from rosrm.errors import NoMaster, Refused
-from rosrm.wording import duration, listed, no_such, standing, standing_for
+from rosrm.wording import duration, listed, local_time, no_such, standing, standing_for
 
 if TYPE_CHECKING:
     from rosrm.model.rows import HostRow, Listing, LogPart, ProcessRow
@@ -242,7 +241,7 @@ class LogReader:
             until = self.archive.collected_until(host, self.process)
             self.notify(
                 f"{self.process}: {self._away[host]}. Its output there is read from "
-                f"{self.archive.directory}, as collected until {_clock(until)}"
+                f"{self.archive.directory}, as collected until {local_time(until)}"
             )
         return sorted(only)
 
@@ -327,10 +326,6 @@ def _up_to(end: int, part: LogPart) -> LogPart:
     if part.next_offset <= end:
         return part
     return replace(part, content=part.content[: end - part.offset], next_offset=end)
-
-
-def _clock(when: float) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(when))
 
 
 def _hosts_of(listed: Listing) -> list[str]:

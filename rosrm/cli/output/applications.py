@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 
 from rich.table import Table
@@ -11,7 +10,7 @@ from rich.text import Text
 from rosrm.cli.output.plain import echo
 from rosrm.cli.output.tables import state, table
 from rosrm.model.applications import ApplicationRow, PlannedAction
-from rosrm.wording import counted, few, listed
+from rosrm.wording import counted, few, listed, local_time
 
 
 def actions(rows: Sequence[PlannedAction]) -> Table:
@@ -64,7 +63,7 @@ def versions(application: ApplicationRow) -> Table:
 def version_cells(application: ApplicationRow) -> Iterator[tuple[str, str, str, str, str]]:
     """Yield number, time, principal, processes and note of each version, the newest first."""
     for row in reversed(application.versions):
-        when = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(row.wall_time))
+        when = local_time(row.wall_time)
         given_up = f"given up: {row.given_up}" if row.given_up else ""
         wanted = _standing(application) if row.wanted else ""
         note = "; ".join(filter(None, (wanted, row.note, given_up)))

@@ -57,7 +57,7 @@ class World(ABC, Generic[HostT]):
 
     @property
     def wall(self) -> float:
-        """Return the Unix time."""
+        """Return the unix time."""
         return self.now
 
     @abstractmethod
