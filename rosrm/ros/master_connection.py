@@ -135,13 +135,20 @@ def find_master(endpoints: Endpoints, who: str, timeout: float) -> srv.Handshake
     try:
         if not wait_for_service(participant, client, deadline):
             return None
-        role, _, name = who.partition(" ")
-        request = srv.Handshake.Request(
-            protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
-        )
-        return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN).answer
+        return _shake_hands(participant, client, who, deadline)
     finally:
         client.destroy()
+
+
+def _shake_hands(
+    participant: Participant, client: SealedClient, who: str, deadline: float
+) -> srv.Handshake.Response | None:
+    """Return the master's description of itself; None: no answer before the deadline."""
+    role, _, name = who.partition(" ")
+    request = srv.Handshake.Request(
+        protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
+    )
+    return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN).answer
 
 
 def _ask_until_answered(
@@ -441,7 +448,10 @@ class MasterClient:
     def _envelope(self) -> Any:
         """Return a request's envelope; renew the beat before the master would reject it as old."""
         if time.monotonic() - self._last_contact > 1.0:
-            hello = find_master(self._endpoints, self._control.sender, self._timeout)
+            # The client is kept: DDS takes up to 0.1 s to discover a new one.
+            client = self._client(srv.Handshake, names.HANDSHAKE)
+            deadline = time.monotonic() + self._timeout
+            hello = _shake_hands(self._participant, client, self._control.sender, deadline)
             if hello is None:
                 raise self._silent(_MASTER)
             self._master, self._last_contact = hello, time.monotonic()

@@ -9,11 +9,12 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from rosrm import Client, NoMaster
+from rosrm.ros.master_connection import MasterClient
 from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.testing.loopback import settings_on_this_machine
 from tests.pages import PYTHON, blocks, run_examples
-from tests.ros.clusters import host
+from tests.ros.clusters import host, service
 from tests.waiting import PATIENCE, quickest
 
 
@@ -41,6 +42,18 @@ def test_a_client_without_a_master_says_so_within_its_time_out():
 
     with claim:
         quickest(connect, 2.5)
+
+
+def test_a_client_greets_the_master_again_without_a_search(make_cluster):
+    """DDS would take up to 0.1 s to discover a new client of the handshake."""
+    cluster = make_cluster(host("h0"))
+    with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
+        services = []
+        for number in range(3):
+            client._last_contact = float("-inf")
+            client.submit([service(f"p{number}")])
+            services.append(list(client._participant.node.clients))
+    assert services[1:] == services[:1] * 2
 
 
 def test_several_threads_join_ros_at_the_same_time():
