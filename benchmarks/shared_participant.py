@@ -108,8 +108,14 @@ class SharedClient:
         self.entity = client
         self.pending_of = client.get_pending_request
         self.askers: WeakKeyDictionary[Any, AskingClient] = WeakKeyDictionary()
+        self._is_ready = False
         # The executor calls this method with the number of each answer.
         client.get_pending_request = self._pending_of_asker
+
+    def service_is_ready(self) -> bool:
+        """Return True if the service was found; rmw searches the endpoints of all slaves for it."""
+        self._is_ready = self._is_ready or self.entity.service_is_ready()
+        return self._is_ready
 
     def _pending_of_asker(self, sequence: int) -> Any:
         return self.askers[self.pending_of(sequence)].get_pending_request(sequence)
@@ -122,7 +128,7 @@ class AskingClient:
         self._shared = shared
         self.get_pending_request = shared.pending_of
         self.remove_pending_request = shared.entity.remove_pending_request
-        self.service_is_ready = shared.entity.service_is_ready
+        self.service_is_ready = shared.service_is_ready
 
     def call_async(self, request: Any) -> Any:
         """Send a request; return the future of its answer."""
