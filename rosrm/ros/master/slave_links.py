@@ -33,6 +33,9 @@ from rosrm_msgs import srv
 #: it, which users can request in any number.
 _MOST_DEFERRED: Final = 1000
 _MOST_INTRODUCTIONS: Final = 100
+#: Seconds from contact with a slave in which DDS discovers its service, if it does at all. Later
+#: orders need no check, for which rmw searches the endpoints of all hosts (4 ms with a thousand).
+_DISCOVERY: Final = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +61,8 @@ class HostLink:
         slave: the registered slave; None: its key was revoked.
         incarnation: of the run that registered last; messages of a former run are ignored.
         is_discovered: DDS has discovered the slave's service since its registration, or since the
-            master received nothing from it.
+            master received nothing from it; or had `_DISCOVERY` for that.
+        searched_from: monotonic seconds of that registration or silence.
         deferred: orders and requests of it that wait for its first beat.
         introductions: introductions to it that wait for its first beat.
         outbox: assignments for the answer to its open request.
@@ -71,6 +75,7 @@ class HostLink:
     control: SealedClient
     incarnation: int
     is_discovered: bool = False
+    searched_from: float = -math.inf
     deferred: list[_Deferred] = field(default_factory=list)
     introductions: list[_Deferred] = field(default_factory=list)
     outbox: list[Assignment] = field(default_factory=list)
@@ -93,6 +98,10 @@ class HostLink:
         self.deferred = [one for one in self.deferred if now < one.deadline]
         self.introductions = [one for one in self.introductions if now < one.deadline]
         return late
+
+    def search(self) -> None:
+        """Let DDS discover the slave's service before the next order."""
+        self.is_discovered, self.searched_from = False, time.monotonic()
 
     def close_poll(self) -> None:
         """Close the open request: it is answered, or its answer can reach no slave."""
@@ -169,7 +178,8 @@ class HostLinks:
         if link is None or link.slave is None or link.slave.peer is not peer:
             link = self._new_link(host_id, description.name, slave)
             self._links[host_id] = link
-        link.slave, link.is_discovered = slave, False
+        link.slave = slave
+        link.search()
         link.close_poll()
         if link.incarnation == description.incarnation:
             # The same run again: assignments that it has not fetched stay valid. But it was
@@ -212,7 +222,7 @@ class HostLinks:
         """
         for host_id in host_ids:
             if host_id in self._links:
-                self._links[host_id].is_discovered = False
+                self._links[host_id].search()
 
     def left(self, link: HostLink) -> None:
         """Close the open request of a slave that stops in an orderly way."""
@@ -342,9 +352,7 @@ class HostLinks:
             self._handle(_order_answered(command.order_id, response))
 
         def send() -> None:
-            # Asked only once, because rmw searches the endpoints of all hosts.
-            link.is_discovered = link.is_discovered or link.control.service_is_ready()
-            if not link.is_discovered:
+            if not self._is_discovered(link):
                 self._wait(link, _Deferred(deadline, send, done))
                 return
             beat = int(self.reading_stats.beat[link.host_id])
@@ -352,6 +360,13 @@ class HostLinks:
             self._client.call(link.control, request, deadline, done)
 
         self.after_first_reading(link, send, deadline, done)
+
+    def _is_discovered(self, link: HostLink) -> bool:
+        """Return True if an order to a slave would not be lost for want of discovery."""
+        if not link.is_discovered:
+            had_time = time.monotonic() - link.searched_from >= _DISCOVERY
+            link.is_discovered = had_time or link.control.service_is_ready()
+        return link.is_discovered
 
     def _order_with_key(self, order: Order, link: HostLink) -> Order:
         match order:

@@ -119,6 +119,16 @@ def test_discovery_is_asked_again_after_a_silence(links, control):
     assert links._client.beats == [100, 200]
 
 
+def test_an_order_long_after_the_registration_does_not_ask_discovery(links, control):
+    """The question takes milliseconds with a thousand hosts, and no longer changes the outcome."""
+    control.ready = False
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
+    links.registered(HOST).searched_from -= 60.0
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
+    assert links._client.beats == [100]
+
+
 def test_an_order_to_a_slave_that_registers_again_waits_for_a_new_beat(links):
     """A host that was cut off has only old readings; an order with their beat would be stale."""
     client = links._client
