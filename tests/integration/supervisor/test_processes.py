@@ -12,7 +12,7 @@ import pytest
 
 from rosrm.core.supervisor.events import FailOrdered, StopOrdered
 from rosrm.model.values import InstanceState, RestartPolicy
-from rosrm.runtime import private_files
+from rosrm.runtime import private_files, timer_slack
 from tests.waiting import wait_gone, wait_until
 
 IGNORES_ALL = """
@@ -71,6 +71,17 @@ def test_a_process_starts_with_every_signal_at_its_default(host, client):
     own_to_glibc = 1 << 31 | 1 << 32  # signals 32 and 33, which its posix_spawn ignores
     assert int(blocked, 16) == 0
     assert int(ignored, 16) & ~own_to_glibc == 0
+
+
+def test_a_process_has_the_usual_timer_slack(host):
+    """A slave has none, and a child inherits that; the supervisor sets the usual slack again."""
+    timer_slack.use_exact_timers()
+    try:
+        client = host.connect()
+    finally:
+        timer_slack.use_usual_timers()
+    host.run(client, host.order("slack", "cat", "/proc/self/timerslack_ns"))
+    assert host.log("slack").read_text() == "50000\n"
 
 
 def test_a_process_has_only_its_own_environment_and_directory(host, client, tmp_path):
