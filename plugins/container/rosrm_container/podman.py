@@ -77,8 +77,11 @@ class Podman:
         return replace(launch, argv=argv, environment=environment)
 
     def leads(self, leader: int) -> bool | None:
-        """Return True if the leader starts or runs a container of this slave."""
-        return self._pid_file(leader) is not None
+        """Return True if the leader starts or runs a container of this slave; None: unknown yet.
+
+        During an execve, as right after its spawn, a process has no command line in /proc.
+        """
+        return None if _words(leader) == [b""] else self._pid_file(leader) is not None
 
     def members(self, leader: int) -> Sequence[int]:
         """Return podman, its monitor, and all processes of the container."""
@@ -113,12 +116,8 @@ class Podman:
 
     def _pid_file(self, leader: int) -> Path | None:
         """Return the file with the pid of the container that a process runs; None: it runs none."""
-        try:
-            words = Path(f"/proc/{leader}/cmdline").read_bytes().split(b"\0")
-        except OSError:
-            return None
         prefix = os.fsencode(f"--pidfile={self._folder}/")
-        found = (word for word in words if word.startswith(prefix))
+        found = (word for word in _words(leader) if word.startswith(prefix))
         option = next(found, None)
         return None if option is None else Path(os.fsdecode(option.partition(b"=")[2]))
 
@@ -139,6 +138,14 @@ class Podman:
         if answer.returncode == 0:
             self._images.add(image)
         return answer.returncode == 0
+
+
+def _words(pid: int) -> list[bytes]:
+    """Return the command line; [b""] during an execve, [] if there is no such process."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
+    except OSError:
+        return []
 
 
 def _variables(launch: Launch) -> tuple[dict[str, str], list[str]]:

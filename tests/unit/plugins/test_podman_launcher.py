@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from dataclasses import replace
 
@@ -82,6 +83,17 @@ def test_a_host_without_the_image_refuses_the_process(launcher) -> None:
 
 def test_other_processes_have_no_container(launcher) -> None:
     """Their leaders are not taken for podman."""
-    assert not launcher.leads(os.getpid())
+    assert launcher.leads(os.getpid()) is False
     assert launcher.members(os.getpid()) == (os.getpid(),)
     assert launcher.root(os.getpid()) == os.getpid()
+
+
+def test_a_leader_without_a_command_line_may_run_a_container_soon(launcher) -> None:
+    """The slave asks again later; otherwise it would not measure the container.
+
+    A zombie stands for a process in its execve: neither has a command line in /proc.
+    """
+    with subprocess.Popen(["true"]) as process:
+        os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+        assert launcher.leads(process.pid) is None
+    assert launcher.leads(process.pid) is False
