@@ -32,7 +32,7 @@ from rosrm.core.master.scheduling.filters import (
 )
 from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import keeping_all, preference
-from rosrm.core.master.scheduling.shortlist import Shortlist
+from rosrm.core.master.scheduling.shortlist import MOST, Shortlist
 from rosrm.core.master.scheduling.traffic import keeping_limits, rows_of
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.devices import COUNTED
@@ -221,6 +221,9 @@ class Ranking:
             self._judge_at(self._every)  # scores of two policies are not comparable
         elif isinstance(judged.columns, slice):
             self._set_values(value)
+        elif len(value) > MOST:
+            self.value[judged.columns] = value
+            self._set_values(self.value)
         else:
             self._put(judged.columns.tolist(), value.tolist())
 

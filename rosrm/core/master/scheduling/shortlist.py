@@ -15,7 +15,7 @@ WANTED: Final = 4
 #: Number of columns that a search finds once values change one by one, to need fewer searches.
 _AHEAD: Final = 8
 #: Number of changed values, or of columns in the list, above which a new search costs less.
-_MOST: Final = 32
+MOST: Final = 12
 #: Comes after each finite value.
 _NONE: Final = (inf, -1)
 
@@ -51,10 +51,6 @@ class Shortlist:
 
     def put(self, columns: list[int], values: list[float]) -> None:
         """Replace the values of some columns, each of which is given once."""
-        if len(columns) > _MOST:
-            self._value[columns] = values
-            self._lowest = self._finite = None
-            return
         for column, new in zip(columns, values, strict=True):
             old = float(self._value[column])
             self._value[column] = new
@@ -70,7 +66,7 @@ class Shortlist:
             lowest.remove(old)
         if new <= self._end:
             insort(lowest, new)
-        if len(lowest) > _MOST or (len(lowest) < WANTED and self._end is not _NONE):
+        if len(lowest) > MOST or (len(lowest) < WANTED and self._end is not _NONE):
             self._lowest, self._searched = None, _AHEAD
 
     def _search(self) -> list[tuple[float, int]]:
