@@ -78,6 +78,13 @@ _BY_TYPE: Final[Mapping[Any, Drawn]] = {
     str | None: st.none() | NAMES,
     Any: _PLAIN,
     Schedule: _SCHEDULES,
+    Limits: st.builds(
+        Limits,
+        memory=st.just(0.0) | st.floats(1e9, 2.0**53),
+        memory_high=st.just(0.0) | st.floats(LEAST_MEMORY, 1e9),
+        cpu=st.just(0.0) | st.floats(LEAST_CPU, 1e4),
+        enforce=st.sampled_from(get_args(Enforcement)),
+    ),
     HeldDevice: st.builds(HeldDevice, PROPER_NAMES, PROPER_NAMES, _SHARES),
     tuple[DeviceNeed, ...]: st.lists(_ASKED, max_size=3, unique_by=lambda one: one.kind).map(tuple),
     tuple[Device, ...]: st.lists(
@@ -116,13 +123,6 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "factor": st.floats(1.0, 100.0),
     "capacity": st.floats(1e-3, 1e18),
     "period": st.floats(1e-3, 10.0),
-    "limits": st.builds(
-        Limits,
-        memory=st.just(0.0) | st.floats(1e9, 2.0**53),
-        memory_high=st.just(0.0) | st.floats(LEAST_MEMORY, 1e9),
-        cpu=st.just(0.0) | st.floats(LEAST_CPU, 1e4),
-        enforce=st.sampled_from(get_args(Enforcement)),
-    ),
     "cpus": st.lists(st.integers(0, LARGEST_CPU_NUMBER), max_size=3, unique=True).map(tuple),
     "nice": st.integers(-20, 19),
     "rate": st.floats(0.0, 1e6),
