@@ -73,6 +73,7 @@ if TYPE_CHECKING:
         RosrmError,
         SkipPlugin,
     )
+    from rosrm.extensions.array_types import BoolArray, FloatArray
     from rosrm.extensions.contracts import (
         Capabilities,
         CheckpointChoice,
@@ -111,7 +112,7 @@ if TYPE_CHECKING:
         SpecChecking,
     )
     from rosrm.extensions.hookspecs import hookimpl
-    from rosrm.extensions.link_views import BoolArray, FloatArray, FlowView, LinkView
+    from rosrm.extensions.link_views import FlowView, LinkView
     from rosrm.extensions.options import options_of
     from rosrm.extensions.sinks import EventSink, NoticesRefused, SinkOffer
     from rosrm.extensions.units import (
@@ -216,6 +217,7 @@ _NAMES: Final = {
     "client.waiting": "WaitResult",
     "config.work": "load_work",
     "errors": "ConfigError NoMaster PluginError Refused RosrmError SkipPlugin",
+    "extensions.array_types": "BoolArray FloatArray",
     "extensions.contracts": (
         "Capabilities CheckpointChoice CheckpointOffer CheckpointPolicy CheckpointView "
         "DeviceFinding FilterOffer GraphDepartureLauncher HostChecking HostLabelling "
@@ -225,7 +227,7 @@ _NAMES: Final = {
         "ProcessView Scores ScoringOffer ScoringPolicy Sessions SpecChecking"
     ),
     "extensions.hookspecs": "hookimpl",
-    "extensions.link_views": "BoolArray FloatArray FlowView LinkView",
+    "extensions.link_views": "FlowView LinkView",
     "extensions.options": "options_of",
     "extensions.sinks": "EventSink NoticesRefused SinkOffer",
     "extensions.units": (

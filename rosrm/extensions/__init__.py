@@ -11,6 +11,7 @@ registry.py          selection of plugins by name, creation of their objects
 made.py              created objects, and checks of them
 declared_fields.py   fields of a spec that an offer declares to read
 placement.py         selected policies and filters, for the core
+array_types.py       types of the arrays in the views of hosts
 link_views.py        links and flows as scoring policies read them
 plugin_calls.py      guard of every call of a plugin
 time_limit.py        time-out of a call

@@ -16,14 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-from rosrm.extensions.link_views import (
-    BoolArray,
-    FloatArray,
-    FlowView,
-    LinkView,
-    no_flows,
-    no_links,
-)
+from rosrm.extensions.link_views import FlowView, LinkView, no_flows, no_links
 from rosrm.model.devices import Device
 from rosrm.model.plan import Execute, Move, Plan
 from rosrm.model.values import (
@@ -38,6 +31,8 @@ from rosrm.model.values import (
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
+
+    from rosrm.extensions.array_types import BoolArray, FloatArray
 
 
 @dataclass(frozen=True)

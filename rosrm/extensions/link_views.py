@@ -9,16 +9,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
-#: Numpy array of 64-bit floats.
-FloatArray: TypeAlias = "npt.NDArray[np.float64]"
-#: Numpy array of booleans.
-BoolArray: TypeAlias = "npt.NDArray[np.bool_]"
+    from rosrm.extensions.array_types import BoolArray, FloatArray
 
 
 class LinkView(Protocol):

@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rosrm.core.master.scheduling.host_views import checked_mask
+from rosrm.extensions.array_types import BoolArray
 from rosrm.extensions.contracts import (
     FilterOffer,
     HostView,
     PlacementFilter,
     ProcessView,
 )
-from rosrm.extensions.link_views import BoolArray
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.values import EMPTY

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rosrm.core.master.scheduling.host_views import checked_scores
+from rosrm.extensions.array_types import BoolArray
 from rosrm.extensions.contracts import (
     HostView,
     ProcessView,
@@ -20,7 +21,7 @@ from rosrm.extensions.contracts import (
     ScoringPolicy,
 )
 from rosrm.extensions.declared_fields import FLOWS_FIELD, SPEC_FIELDS, declared_spec
-from rosrm.extensions.link_views import BoolArray, FlowView, no_flows
+from rosrm.extensions.link_views import FlowView, no_flows
 from rosrm.extensions.plugin_calls import required
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.model.devices import DeviceNeed

@@ -99,6 +99,11 @@ def test_every_name_is_there_and_in_the_help():
         assert re.search(rf"\b{name}\b", rosrm.__doc__), f"{name} is not in rosrm.__doc__"
 
 
+def test_the_types_of_arrays_are_types():
+    """A plugin may use them in an expression, as `FloatArray | None` is."""
+    assert (rosrm.FloatArray | rosrm.BoolArray | None).__args__[-1] is type(None)
+
+
 def test_an_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'rosrm' has no attribute 'Cleint'"):
         _ = rosrm.Cleint
