@@ -35,8 +35,7 @@ received = []
 node.create_subscription(ResourceInfo, "resource_info", received.append, 10)
 publisher = node.create_publisher(ResourceInfo, "resource_info", 10)
 node.create_client(Reload, "reload")
-sent = ResourceInfo(host_id=3)
-sent.usage[2] = 0.5
+sent = ResourceInfo(host_id=3, usage=[0.0, 0.0, 0.5])
 end = time.monotonic() + 20.0
 while not received and time.monotonic() < end:
     publisher.publish(sent)
