@@ -6,7 +6,7 @@ and the next one is started on the same state directory. A client then submits o
 host. All times count from that start, and each figure is a median:
 
 - `lock_s`: until the state directory is locked, after most imports.
-- `restored_s`: until the journal is read, by the record of the start.
+- `restored_s`: until the journal is read: the time of the event `master_started`.
 - `first_host_s`, `last_host_s`: until the first and the last host have registered.
 - `first_assigned_s`, `placed_s`: until the first job is assigned, and until the slave of the last
   host has received its job.
@@ -38,14 +38,14 @@ from rosrm.testing.local_cluster import LocalCluster
 _PATIENCE = 120.0
 #: Seconds after which the estimated needs of the processes no longer count as load.
 _SETTLED = ProcessDefaults().settle + 1.0
-#: Events of one restart, at most.
+#: Most events of one restart.
 _EVENTS = 10_000
 #: Seconds between the last assignment of a round and the next round.
 _PAUSE = 1.0
 
 
 def _restart(cluster: LocalCluster, number: signal.Signals) -> tuple[float, MasterClient]:
-    """End the master and start it again; return the unix time of that, and a new client.
+    """End the master and start it again; return the unix time of the start, and a new client.
 
     The participant of the client exists before the start, so that its creation takes no time from
     the master.
@@ -80,7 +80,7 @@ def _times(client: MasterClient, started: float, jobs: set[str]) -> dict[str, fl
 def _round(
     cluster: LocalCluster, crowd: Crowd, number: int, arguments: argparse.Namespace
 ) -> dict[str, float]:
-    """Restart the master once, and return the times of that.
+    """Restart the master once, and return the measured times.
 
     Raises:
         RosrmError: a host got no job.

@@ -12,12 +12,12 @@ slave's code. The master publishes its own figures on `master_load`, by its own 
 - `request_process_*_ms`: one job at a time, from the call of `submit` to the assignment at the
   slave. The master answers one request; the answer reaches the reader of each slave.
   `assigned_*_ms`: from the same call to the master's record of the assignment.
-- `request_process_master_cpu_ms`, `request_process_slaves_cpu_ms`: CPU for each of these jobs of
-  the master, and of all simulated slaves, beyond their CPU without jobs.
+- `request_process_master_cpu_ms`, `request_process_slaves_cpu_ms`: CPU time of the master, and of
+  all simulated slaves, for each of these jobs, beyond their CPU time without jobs.
 
 With several numbers (`--slaves 1000 5000 1000 5000`), each is measured in turn. `cost_ratio` is the
 cost of a slave-cycle (`us_per_message`) with the most slaves over that with the fewest, of the
-medians. All have the same `--hz`: reduce it until the machine can offer it for the most slaves.
+medians. All use the same `--hz`: choose one that the machine reaches with the most slaves.
 
 Where permitted, everything runs in a network namespace of its own and uses UDP, as real hosts do;
 `transports` names the transports used.
@@ -217,7 +217,7 @@ def occupied_cluster(
 
 
 def _start_processes(cluster: LocalCluster, count: int, timeout: float) -> None:
-    """Submit so many services, and wait until all of them are placed."""
+    """Submit `count` services, and wait until all of them are placed."""
     names = [f"process_{number}" for number in range(count)]
     for start in range(0, count, _AT_ONCE):  # a busy machine needs longer for all of them
         part = names[start : start + _AT_ONCE]
@@ -271,7 +271,7 @@ def requests(cluster: LocalCluster, crowd: Crowd, idle: Mapping[str, float]) -> 
     Args:
         cluster: of the master.
         crowd: the slaves.
-        idle: the figures of the readings, without jobs.
+        idle: the figures of `readings`, measured without jobs.
     """
     crowd.toggle()
     began, cpu = time.monotonic(), _cpu_of_master(cluster)
@@ -334,7 +334,7 @@ def measure(
 
     Args:
         arguments: of the command line.
-        slaves: number of them.
+        slaves: number of simulated slaves.
         folder: for the state of the master.
         security: of the cluster.
 
@@ -364,7 +364,7 @@ def measure(
 
 
 def _costs(runs: Sequence[dict[str, float]]) -> dict[str, Any]:
-    """Return the figures of one run; of several, each one's and the ratio of their costs."""
+    """Return the figures of a single run; of several runs, their figures and the ratio of costs."""
     if len(runs) == 1:
         return dict(runs[0])
     costs: dict[float, list[float]] = {}
@@ -382,7 +382,7 @@ def main() -> int:
         type=_positive(int),
         nargs="+",
         default=[1000],
-        help="number of simulated slaves; of several numbers, each is measured in turn",
+        help="numbers of simulated slaves, e.g. 1000 5000; each is measured in turn",
     )
     command_line.add_argument(
         "--hz",

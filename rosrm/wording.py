@@ -213,7 +213,7 @@ def duration(seconds: float) -> str:
 
 
 def local_time(when: float) -> str:
-    """Return a unix time as date and time of this machine's time zone."""
+    """Return a unix time as date and time in this machine's time zone."""
     return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(when))
 
 

@@ -45,7 +45,7 @@ _EVENTS: Final = STAMPS | BESIDE
 _DIGITS: Final = 19
 #: Bytes of a log that one request reads.
 _PART: Final = 1 << 16
-#: Bytes at the beginning of a log in which the stamps are looked for: the process may write first.
+#: Bytes at the beginning of a log that are searched: the process may write before its trace.
 _BEGINNING: Final = 1 << 22
 #: Seconds between two requests. The first follows after them, so that it delays no start.
 _PERIOD: Final = 0.1

@@ -5,7 +5,7 @@ frozen dataclass of options, and a function that creates the object. The configu
 offers by name. Their options are checked against the dataclass's annotations before the object is
 created.
 
-Slaves and commands import this module. So numpy is imported only where an array is made.
+Slaves and commands import this module. So it imports numpy only where it makes an array.
 """
 
 from __future__ import annotations

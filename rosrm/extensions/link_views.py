@@ -1,6 +1,6 @@
 """Links and flows as scoring policies read them: arrays over hosts, with NaN where not measured.
 
-Slaves and commands import this module. So numpy is imported only where an array is made.
+Slaves and commands import this module. So it imports numpy only where it makes an array.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class MeasuredLinks:
 
 @cache
 def no_links() -> LinkView:
-    """Return the links of no host."""
+    """Return a `LinkView` without hosts."""
     import numpy as np  # noqa: PLC0415 - see above
 
     return MeasuredLinks((), np.zeros((0, 0)), np.zeros((0, 0)))
@@ -117,7 +117,7 @@ def _per_second(rate: float) -> str:
 
 @cache
 def no_flows() -> FlowView:
-    """Return no flows on no host; sums over them are 0 for any number of hosts."""
+    """Return a `FlowView` without flows, whose sums are 0 for any number of hosts."""
     import numpy as np  # noqa: PLC0415 - see above
 
     return FlowView(

@@ -72,9 +72,9 @@ _log = logging.getLogger("rosrm.master")
 _TICK: Final = 0.05
 #: Least seconds to the tick at which the lease of a host ends.
 _SOON: Final = 0.005
-#: Seconds for the discovery of another running master, from the creation of the participant, and
-#: the least seconds of these for its answer to a handshake.
+#: Seconds for the discovery of another running master, from the creation of the participant.
 _DISCOVERY: Final = 1.0
+#: Least seconds of these for the answer of that master to a handshake.
 _ANSWER: Final = 0.5
 #: Seconds within which two starts of masters count as simultaneous.
 _AT_ONCE: Final = 1.0
@@ -138,7 +138,7 @@ class MasterRuntime:
         self._held: JournalStall | None = None
         self._deadlines = Deadlines()
         self._from_threads: deque[Callable[[], None]] = deque()
-        self._behind = 0.0  # seconds that the core's clock is behind, by its start and blocked time
+        self._behind = 0.0  # seconds that the core's clock is behind: its start and blocked time
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
             opened.enter_context(
@@ -160,7 +160,7 @@ class MasterRuntime:
             self._endpoints = SealedEndpoints(self._participant, security)
             self._grants = GrantsWatch(security)
             last = self._last_run()
-            # During the restore DDS discovers another master, if there is one.
+            # During the restore, DDS discovers another master if there is one.
             self._state = self._restored(placement, strategies, last, joined)
             self._refuse_second(max(_ANSWER, joined + _DISCOVERY - self._now()))
             self._behind = self._now() - joined  # no host could report in that time
@@ -202,7 +202,7 @@ class MasterRuntime:
         return state
 
     def _begin_run(self, last: _LastRun, now: float) -> None:
-        """Make the begin of this run durable, before anything is decided in it."""
+        """Write the start of this run to the journal, before any decision of it."""
         state = self._state
         journal_gap.begin(state, last.newest, now, machine_rebooted=last.machine_rebooted)
         started = f"master {self._config.name} started, epoch {state.epoch}"

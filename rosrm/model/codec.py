@@ -68,8 +68,8 @@ def _plain(value: object) -> object:
     raise TypeError(f"{type(value).__name__} is no JSON")
 
 
-#: Encodes plain values. Made once, because `json.dumps` with a `default` makes an encoder for each
-#: call.
+#: Encodes plain values as JSON. Created once, because `json.dumps` with a `default` creates an
+#: encoder for each call.
 to_json: Final = json.JSONEncoder(default=_plain).encode
 
 

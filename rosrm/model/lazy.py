@@ -10,7 +10,7 @@ from rosrm.model.codec import to_json, to_plain
 from rosrm.model.plan import Plan
 from rosrm.model.values import ProcessSpec
 
-#: Types of most values in a mapping; a comparison of types takes a fifth of an `isinstance`.
+#: Types of most values in a mapping. A look-up here takes a fifth of the time of `isinstance`.
 _COMMON: Final = frozenset({str, int, float, bool, type(None), dict, list})
 
 
@@ -68,7 +68,7 @@ class Plain(Lazy):
 
 
 def mapping_to_json(value: Mapping[str, Any]) -> str:
-    """Return a mapping as JSON; the texts of its lazy values are inserted, before the others."""
+    """Return a mapping as JSON: first its lazy values, by their `text`, then all others."""
     lazy = {
         name: item for name, item in value.items()
         if type(item) not in _COMMON and isinstance(item, Lazy)

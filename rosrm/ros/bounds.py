@@ -23,8 +23,8 @@ MOST_ENTRIES: Final = 1 << 16
 #: Most letters and entries of a whole message, and of the spec of one process.
 LARGEST_MESSAGE: Final = 1 << 26
 LARGEST_SPEC: Final = 1 << 20
-#: Most letters and entries of a nested message whose size is remembered.
-_MOST_REMEMBERED: Final = 512
+#: Most letters and entries of a nested message whose size is cached.
+_MOST_CACHED: Final = 512
 
 _OTHER_LETTERS: Final = {
     "Sealed.principal": sealed_codec.MOST_LETTERS,
@@ -100,7 +100,7 @@ class Bound(NamedTuple):
 
     Attributes:
         field: its name.
-        slot: attribute of messages that has its value; the property of its name is slower.
+        slot: attribute of messages with its value. The property of the same name is slower.
         entries: most entries; 0: it is no sequence.
         letters: most letters of the text, or of each text in the sequence; 0: it has none.
         nested: messages are in it.
@@ -168,7 +168,7 @@ def _size(message: Any) -> int:
     return size
 
 
-_size_of_known: Final = remembered(_size, lambda size: size <= _MOST_REMEMBERED)
+_size_of_known: Final = remembered(_size, lambda size: size <= _MOST_CACHED)
 
 
 def _beyond(kind: type[Any], field: str, what: str, given: int, most: int) -> Refused:

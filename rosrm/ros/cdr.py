@@ -6,9 +6,9 @@ compares the results.
 
 Most nested messages have the same content as an earlier one, above all the policies of processes. A
 CDR form ends where its content says. So bytes that begin like an earlier form, at the same
-alignment, are that message again, and the reader returns the same object. The writer finds the form
-of a nested message by its identity. A message that was received or sent must therefore not be
-changed, except for its outermost fields.
+alignment, are that message again, and the reader returns the same object. The writer caches the
+form of a nested message by the identity of the object. A message that was received or sent must
+therefore not be changed, except for its outermost fields.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _CODES: Final = {
 
 #: Returns a value and the offset behind it, given the content and the offset of the value.
 _Reader = Callable[[bytes, int], tuple[Any, int]]
-#: Adds the form of a value to the parts, and returns the offset behind it, given that of the value.
+#: Adds the form of a value to the parts; takes the offset of the value, returns that behind it.
 _Writer = Callable[[Any, list[bytes], int], int]
 
 
@@ -190,9 +190,9 @@ def _numbers_reader(code: str) -> _Reader:
 
 
 def form_of(message: Any) -> bytes:
-    """Return the CDR form of a message of a type of rosrm, as `written` or as rclpy writes it.
+    """Return the CDR form of a message of rosrm: by `written` if its type contains a spec.
 
-    rclpy is faster for long lists of flat messages, such as the rows of a listing.
+    For other types rclpy is faster, such as long lists of flat messages (the rows of a listing).
     """
     return written(message) if _has_specs(type(message)) else bytes(serialize_message(message))
 
@@ -209,7 +209,7 @@ _has_specs: Final[Callable[[Any], bool]] = cache(_find_specs)
 
 
 def written(message: Any) -> bytes:
-    """Return the CDR form of a message of a type of rosrm, without rclpy.
+    """Return the CDR form of a message of rosrm, without rclpy.
 
     Raises:
         ValueError: a field has a value that its type does not allow.
@@ -249,11 +249,11 @@ def _writer(declared: str) -> _Writer:
         return _sequence_writer(declared.removeprefix("sequence<").removesuffix(">"))
     if declared in _CODES:
         return _number_writer(_CODES[declared])
-    return _remembering(_message_writer(_kind(declared)))
+    return _caching(_message_writer(_kind(declared)))
 
 
-def _remembering(write_new: _Writer) -> _Writer:
-    """Return a writer that finds the forms of the messages that were written last."""
+def _caching(write_new: _Writer) -> _Writer:
+    """Return a writer that caches the forms of the newest messages."""
 
     def form_at(alignment: int, message: Any) -> bytes:
         parts: list[bytes] = []

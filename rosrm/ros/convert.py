@@ -113,25 +113,25 @@ _FORMS: Final[Mapping[Any, tuple[_Convert, _Convert]]] = {
     tuple[int, ...]: (list, lambda numbers: tuple(map(int, numbers))),
     Mapping[str, str]: (pairs, mapping),
     Mapping[str, values.StartCondition]: (pairs, mapping),
-    # Not `value`, which is a property in Python.
+    # Not `value`, which is a property, and so slower.
     values.Kind: (attrgetter("_value_"), values.Kind),
     values.InstanceState: (attrgetter("_value_"), values.InstanceState),
 }
 
 
 class _Field(NamedTuple):
-    """A field of a dataclass, and of messages.
+    """A field of a dataclass and of its message.
 
     Attributes:
         name: in the dataclass.
-        there: in messages.
-        slot: attribute of messages that has its value; the property `there` is slower.
+        sent_as: in messages.
+        slot: attribute of messages with its value. The property `sent_as` is slower.
         to_msg: converts its value to that in messages.
         from_msg: the inverse of `to_msg`.
     """
 
     name: str
-    there: str
+    sent_as: str
     slot: str
     to_msg: _Convert
     from_msg: _Convert
@@ -141,10 +141,10 @@ def _fields(kind: Any) -> tuple[_Field, ...]:
     """Return the fields of a dataclass."""
     found = []
     for name, hint in get_type_hints(kind).items():
-        there = _RENAMED.get(name, name)
-        # The property makes an array of numbers.
-        slot = there if hint == tuple[int, ...] else f"_{there}"
-        found.append(_Field(name, there, slot, *_forms(hint)))
+        sent_as = _RENAMED.get(name, name)
+        # Only the property converts numbers to an array.
+        slot = sent_as if hint == tuple[int, ...] else f"_{sent_as}"
+        found.append(_Field(name, sent_as, slot, *_forms(hint)))
     return tuple(found)
 
 
@@ -154,16 +154,16 @@ _known_fields: Final[Callable[[Any], tuple[_Field, ...]]] = cache(_fields)
 
 def _forms(hint: Any) -> tuple[_Convert, _Convert]:
     if isinstance(hint, type) and is_dataclass(hint):
-        there, back = _dataclass_forms(hint)
-        # A user may change a mapping between two submissions.
+        to_msg, from_msg = _dataclass_forms(hint)
+        # A user may change a mapping between two submissions, so its message is not cached.
         is_fixed = all(get_origin(one) is not Mapping for one in get_type_hints(hint).values())
-        return remembered(there) if is_fixed else there, remembered(back)
+        return remembered(to_msg) if is_fixed else to_msg, remembered(from_msg)
     inner = get_args(hint)[0] if get_origin(hint) is tuple else None
     if isinstance(inner, type) and is_dataclass(inner) and hasattr(msg, inner.__name__):
-        there, back = _dataclass_forms(inner)
+        to_msg, from_msg = _dataclass_forms(inner)
         return (
-            lambda items: [there(item) for item in items],
-            lambda items: tuple(back(item) for item in items),
+            lambda items: [to_msg(item) for item in items],
+            lambda items: tuple(from_msg(item) for item in items),
         )
     return _FORMS.get(hint, (_unchanged, _unchanged))
 
@@ -179,8 +179,8 @@ def _unchanged(value: Any) -> Any:
 def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
     """Return a dataclass as a message of a type with the same fields; `others` are converted."""
     converted = made(message, **others)
-    for name, there, slot, convert, _ in _known_fields(type(value)):
-        if there not in others:
+    for name, sent_as, slot, convert, _ in _known_fields(type(value)):
+        if sent_as not in others:
             field = getattr(value, name)
             setattr(converted, slot, field if convert is _unchanged else convert(field))
     return converted

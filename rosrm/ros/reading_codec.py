@@ -1,7 +1,7 @@
 """Encoder of `resource_info`, and the layout of the message.
 
-All messages have one size, so their CDR form is a C struct behind a header of four bytes. A test
-compares every field with rclpy's own serialisation. The master's decoder is a module of its own,
+All messages have the same size, so their CDR form is a C struct behind a header of four bytes. A
+test compares every field with rclpy's own serialisation. The master's decoder is a separate module,
 because it imports numpy and the master's events, which would cost each slave memory.
 """
 
@@ -17,7 +17,7 @@ from rosrm.version import PROTOCOL_VERSION
 
 #: Encapsulation: little-endian plain CDR, no options.
 _HEADER: Final = b"\x00\x01\x00\x00"
-#: The header, the numbers, then usages and limits, each behind the number of the slots.
+#: The header, the numbers, then the usages and the limits, each sequence after its length.
 _FORM: Final = struct.Struct(f"<4sHHI5Q3I I{RESOURCE_SLOTS}f I{RESOURCE_SLOTS}f")
 
 #: Bytes of each serialised message.
@@ -33,7 +33,7 @@ MOST_QUIET: Final = 255
 
 @dataclass(slots=True)
 class Reading:
-    """A `ResourceInfo`; the fields are described there."""
+    """Fields of a `ResourceInfo`, described in its message file."""
 
     protocol_version: int = PROTOCOL_VERSION
     flags: int = 0

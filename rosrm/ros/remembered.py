@@ -1,8 +1,8 @@
-"""Results of functions for objects that do not change, found by the identity of the object.
+"""Cache of function results by the identity of the argument, which must not change.
 
-Most processes have the same policies, and so the same objects. To find a result touches a few cache
-lines, where the function itself would read all fields. After an idle moment, in which the caches
-were used by others, such reads take most of the time of a message.
+Most processes have the same policies, and so the same objects. A look-up reads a few cache lines of
+the CPU; the function would read all fields. After a pause, in which other programs have used the
+CPU's caches, such reads take most of the time of a message.
 """
 
 from __future__ import annotations

@@ -84,7 +84,7 @@ def envelope_to_msg(envelope: Envelope) -> msg.Sealed:
 
 
 def envelope_from_msg(message: msg.Sealed) -> Envelope | None:
-    """Return the envelope in a ROS message; None: a run has another length."""
+    """Return the envelope in a ROS message; None: a run is not `RUN_BYTES` long."""
     run, receiver_run = bytes(message.run), bytes(message.receiver_run)
     if not len(run) == len(receiver_run) == RUN_BYTES:
         return None

@@ -1,4 +1,4 @@
-"""Sealed readings: `resource_info` in messages of one size, which decode fastest.
+"""Sealed readings: `resource_info` in messages of the same size, which decode fastest.
 
 Slave and master write and read the CDR form of `rosrm_msgs/SealedReading` without rclpy. A test
 compares this module with rclpy.

@@ -182,8 +182,8 @@ def _marks(
     """Return the marks of a part, including one after its end, and the end of the part.
 
     With `now` the file is still written, and bytes without a mark count as written now. The
-    supervisor makes the index a moment after the first output; until then the time of the newest
-    output counts as that of the start.
+    supervisor creates the index shortly after the first output. Until then, the time of the newest
+    output counts as the time of the start.
     """
     with log_index.Index(str(segment.path)) as index:
         first = index.find(lambda mark: mark.offset >= begin)

@@ -114,7 +114,7 @@ class InstanceGroups:
     def add(self, key: Key, limits: LimitRule) -> None:
         """Make the groups that a running instance lacks for new limits; move its processes there.
 
-        A limit without its group, or whose group lacks a process, is in `lacking`.
+        `lacking` returns each limit whose group is missing or does not contain all processes.
         """
         made = self._made.get(key, ())
         for tree in self.trees:
@@ -132,7 +132,7 @@ class InstanceGroups:
                     self._made[key] = (*self._made[key], tree)
 
     def _undo(self, key: Key, tree: Tree) -> None:
-        """Move the processes out of a group that others did not enter, and remove the group."""
+        """Move processes back out of a group that not all could enter, and remove the group."""
         path = _path(tree, key)
         for pid in pids(path):
             with contextlib.suppress(OSError):

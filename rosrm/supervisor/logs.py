@@ -4,7 +4,7 @@ A process holds its log open for appending. So the supervisor copies a full log 
 it; output between the copy and the truncation is lost. A flooding process can exceed the bound by
 its output of one interval. Dropped output shows in the offsets of the index beside each file
 (`log_index`). The index also holds the time of output: each check that finds a log grown adds a
-record. The first one that does so makes the index: a program without output needs none.
+record. The first such check creates the index, because a program without output needs none.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class _Log:
             self.base = index.mark(0).offset if index.count else 0
             self.size = index.mark(index.count - 1).offset - self.base if index.count else 0
             self._has_index = index.count > 0
-        self._start: Mark | None = None  # of the program, which has no output and no index yet
+        self._start: Mark | None = None  # of a program without output and index
 
     def begin(self, size: int, pid: int) -> None:
         """Record the start of a program at the end of the log file, which has `size` bytes."""

@@ -65,9 +65,9 @@ def open_tab(page: Any, name: str) -> None:
 
 
 def serious_findings(page: Any) -> list[tuple[str, str]]:
-    """Return what axe-core calls serious or critical: rules, and the first element of each.
+    """Return the serious and critical findings of axe-core: each rule, and its first element.
 
-    A table's row is drawn before its cells, so this waits for them first.
+    The page draws a row before its cells, so wait until all rows have cells.
     """
     page.wait_for_function(_ALL_ROWS_HAVE_CELLS)
     found = Axe().run(page).response["violations"]

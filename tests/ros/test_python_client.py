@@ -44,8 +44,8 @@ def test_a_client_without_a_master_says_so_within_its_time_out():
         quickest(connect, 2.5)
 
 
-def test_a_client_greets_the_master_again_without_a_search(make_cluster):
-    """DDS would take up to 0.1 s to discover a new client of the handshake."""
+def test_a_client_repeats_the_handshake_with_the_same_ros_client(make_cluster):
+    """Otherwise DDS would take up to 0.1 s to discover a new ROS client for the handshake."""
     cluster = make_cluster(host("h0"))
     with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
         services = []

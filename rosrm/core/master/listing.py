@@ -182,7 +182,7 @@ def _host_of(process: Process, owner: Instance | None) -> str:
 
 
 def _missing_standby(state: MasterState, process: Process) -> str:
-    """Return why a running process has no ready standby; "": it has one, or asks for none."""
+    """Return the reason for the lack of a ready standby; "": one is ready, or none is wanted."""
     standby = state.standbys.get(process.name)
     step = None if standby is None else standby.current_step
     is_ready = isinstance(step, Configure) and step.phase is HandoffPhase.SWITCH

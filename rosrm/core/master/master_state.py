@@ -80,8 +80,7 @@ class MasterState:
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
         scheduled: names of the processes with a schedule that are not terminal.
-        nodes: each node of the ROS graph to the names of the processes with it that are not
-            terminal.
+        nodes: ROS node (`node_of`) to the names of the processes that run it and are not terminal.
         applications: by name.
         modes: sets of applications, and the one in force.
         terminal: names of the terminal processes, in the order in which they ended.

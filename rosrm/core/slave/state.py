@@ -142,8 +142,8 @@ class SlaveState:
         renewed_at: time of the last `Renew` to the supervisor.
         held: all instances, including ended ones that may still be reported.
         alive: those of `held` that have not ended. Many ended ones would slow down each start.
-        nodes: those of `alive` whose node is awaited in the ROS graph. The loop of the slave looks
-            at them in each turn, and most jobs have no node.
+        nodes: those of `alive` with a node in the ROS graph, because the loop of the slave checks
+            them in each turn, and most jobs have no node.
         waiting: assignments that start as soon as the bounds allow, in order.
         tombstones: ended and refused instances, which never start on this host again.
     """
@@ -166,7 +166,7 @@ class SlaveState:
         """Add an instance, or note that its status is another one."""
         self.held[instance] = held
         if held.status.state.ended:
-            self._bury(instance)
+            self._drop_alive(instance)
             return held
         self.alive[instance] = held
         if held.awaited is not None:
@@ -175,10 +175,10 @@ class SlaveState:
 
     def drop(self, instance: InstanceId) -> HeldInstance:
         """Forget an instance, and return it."""
-        self._bury(instance)
+        self._drop_alive(instance)
         return self.held.pop(instance)
 
-    def _bury(self, instance: InstanceId) -> None:
+    def _drop_alive(self, instance: InstanceId) -> None:
         self.alive.pop(instance, None)
         self.nodes.pop(instance, None)
 
@@ -216,7 +216,7 @@ class SlaveState:
         )
 
     def slots(self) -> int:
-        """Return the number of waiting instances that may run beside the others."""
+        """Return the number of further instances that `max_processes` allows to run."""
         waiting = len(self.waiting)
         return self.max_processes - (self.live() - waiting) if self.max_processes else waiting
 
@@ -228,7 +228,7 @@ class SlaveState:
         return max(0, most)
 
     def why_wait(self) -> str:
-        """Return why the waiting instances must wait; call this when no more of them may start."""
+        """Return the reason why instances wait; call this when none of them may start."""
         if self.slots() <= 0:
             return "waits for a free slot there"
         return f"waits until others there have started (max_starting: {self.max_starting})"

@@ -14,7 +14,7 @@ from rosrm.model.values import RESOURCE_SLOTS
 from rosrm.ros.reading_codec import ACCEPTING, QUIET_SHIFT
 from rosrm.version import PROTOCOL_VERSION
 
-#: Form of a message. The numbers of usages and of limits are `RESOURCE_SLOTS`.
+#: Layout of a message. The counts `usages` and `limits` are `RESOURCE_SLOTS`.
 LAYOUT: Final = np.dtype(
     [
         ("header", "S4"),

@@ -33,8 +33,8 @@ from rosrm_msgs import srv
 #: it, which users can request in any number.
 _MOST_DEFERRED: Final = 1000
 _MOST_INTRODUCTIONS: Final = 100
-#: Seconds from contact with a slave in which DDS discovers its service, if it does at all. Later
-#: orders need no check, for which rmw searches the endpoints of all hosts (4 ms with a thousand).
+#: Seconds after a registration in which DDS discovers the service of a slave, if it does at all.
+#: Later orders skip the check, in which rmw searches the endpoints of all hosts (4 ms for 1,000).
 _DISCOVERY: Final = 30.0
 
 
@@ -60,8 +60,8 @@ class HostLink:
     Attributes:
         slave: the registered slave; None: its key was revoked.
         incarnation: of the run that registered last; messages of a former run are ignored.
-        is_discovered: DDS has discovered the slave's service since its registration, or since the
-            master received nothing from it; or had `_DISCOVERY` for that.
+        is_discovered: since the registration or the last silence of the slave, DDS has discovered
+            its service, or `_DISCOVERY` has passed.
         searched_from: monotonic seconds of that registration or silence.
         deferred: orders and requests of it that wait for its first beat.
         introductions: introductions to it that wait for its first beat.
@@ -100,7 +100,7 @@ class HostLink:
         return late
 
     def search(self) -> None:
-        """Let DDS discover the slave's service before the next order."""
+        """Require that DDS discovers the slave's service before the next order."""
         self.is_discovered, self.searched_from = False, time.monotonic()
 
     def close_poll(self) -> None:
@@ -216,9 +216,10 @@ class HostLinks:
                 self._handle(happened.KeyRevoked(link.host_id, link.incarnation))
 
     def note_silent(self, host_ids: Iterable[int]) -> None:
-        """Look again for the services of silent hosts, which DDS forgets after its lease.
+        """Search again for the services of silent hosts, which DDS removes when its lease ends.
 
-        Such a slave need not register again: with a cut in one direction it receives the beats.
+        Such a slave may not register again: it still receives beats if only its own messages are
+        lost.
         """
         for host_id in host_ids:
             if host_id in self._links:
@@ -362,7 +363,7 @@ class HostLinks:
         self.after_first_reading(link, send, deadline, done)
 
     def _is_discovered(self, link: HostLink) -> bool:
-        """Return True if an order to a slave would not be lost for want of discovery."""
+        """Return True if an order need not wait until DDS discovers the slave's service."""
         if not link.is_discovered:
             had_time = time.monotonic() - link.searched_from >= _DISCOVERY
             link.is_discovered = had_time or link.control.service_is_ready()

@@ -39,12 +39,13 @@ _log = logging.getLogger("rosrm.slave")
 _PATIENCE: Final = 3.0
 #: Seconds after which a long poll is repeated, because it may have been lost.
 _POLL_AGAIN: Final = 30.0
-#: The same for the first handshake and the first poll, which may be sent before DDS has discovered
-#: the master: for `LEASE` a killed master's services still look ready. Then the interval grows.
+#: The same for the first handshake and the first poll; then the interval grows. The first ones can
+#: be lost, because DDS has not discovered the master yet, or because the services of a killed
+#: master look ready until its DDS lease ends.
 _FIRST_AGAIN: Final = 0.25
-#: Factor by which the interval of handshakes grows: with few of them, a thousand slaves that lost
-#: their master do not keep the next one from answering.
-_GREET_SELDOM: Final = 4.0
+#: Factor by which the interval between handshakes grows. Otherwise the handshakes of a thousand
+#: slaves that lost their master would delay the answers of the next one.
+_GREET_GROWTH: Final = 4.0
 #: Seconds between a refused request for work and the next one.
 _ASK_AGAIN: Final = 0.2
 #: Seconds for which registration is retried while the name is taken: the former run of this slave
@@ -195,14 +196,14 @@ class SlaveEndpoint:
             self.publish_statuses((), complete=False)
 
     def _should_greet(self, now: float) -> bool:
-        """Return True if a handshake is due: none was sent, or the newest has had no answer yet."""
+        """Return True if a handshake is due: none was sent, or the newest got no answer in time."""
         if self.link is not MasterLink.GREETING:
             return self.link is MasterLink.SEARCHING
         return now - self._asked_at >= self._greet_again
 
     def _greet(self, now: float) -> None:
         if self.link is MasterLink.GREETING:
-            self._greet_again = min(_GREET_SELDOM * self._greet_again, _PATIENCE)
+            self._greet_again = min(_GREET_GROWTH * self._greet_again, _PATIENCE)
         self.link = MasterLink.GREETING
         self._asked_at = now
         request = srv.Handshake.Request(

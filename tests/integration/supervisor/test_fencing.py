@@ -98,8 +98,8 @@ def test_an_alive_fence_is_renewed_by_the_running_slave_alone(host, client):
         alive = time.monotonic()
         assert alive < until, "no instance was fenced"
         client.send(ContactReported(0.0, alive))
-        told = client.receive(0.1)
-        ended = {status.instance.process for status in told if status.state.ended}
+        received = client.receive(0.1)
+        ended = {status.instance.process for status in received if status.state.ended}
     assert ended == {"two"}
     status = host.ended(client, "one")
     assert time.monotonic() - alive >= 4.0

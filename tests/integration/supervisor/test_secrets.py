@@ -18,7 +18,7 @@ SHOW = "import os, time; print(len(os.environ['TOKEN']), flush=True); time.sleep
 def secret_of(pid: int) -> bytes:
     """Return the value of TOKEN in the environment of a process.
 
-    The kernel lets the parent of a new process go on before the environment can be read.
+    The parent of a new process can continue before the kernel lets others read the environment.
     """
     environment = Path(f"/proc/{pid}/environ")
     variables = wait_until(environment.read_bytes, f"the environment of {pid}").split(b"\0")

@@ -302,7 +302,7 @@ def test_a_registered_host_has_the_reservations_of_its_processes_at_once() -> No
 
 
 @pytest.mark.parametrize(("ran", "is_placed"), [(11.0, True), (9.0, False)])
-def test_the_readings_show_the_load_of_what_ran_before_the_restart(
+def test_readings_show_the_load_of_processes_from_before_the_restart(
     ran: float, is_placed: bool
 ) -> None:
     """Otherwise a host with many processes would get no work for `settle` after a restart."""

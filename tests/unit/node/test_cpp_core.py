@@ -110,7 +110,7 @@ def test_an_envelope_of_the_own_codec_is_read(core):
 
 @pytest.mark.parametrize(("run", "receiver_run"), [(0, 16), (15, 17), (17, 15), (16, 0)])
 def test_an_envelope_with_a_run_of_another_length_is_malformed(core, run, receiver_run):
-    """Otherwise a run would have bytes of the next field."""
+    """Otherwise a run would contain bytes of the next field."""
     sent = Sealed(run=array("B", bytes(run)), receiver_run=array("B", bytes(receiver_run)))
     assert rewritten(core, 3, serialize_message(sent)) is None
 

@@ -64,7 +64,7 @@ def test_each_message_is_what_rclpy_reads(kind: Any) -> None:
 
 @pytest.mark.parametrize("kind", list(kinds()), ids=lambda kind: str(kind.__name__))
 def test_rclpy_reads_each_message_that_is_written(kind: Any) -> None:
-    """Every type, with random content; nested messages are found again by their identity."""
+    """Every type, with random content, twice: the second time from the cache of nested messages."""
     chance = random.Random(kind.__name__)
     for _ in range(20):
         message = filled(kind, chance)
@@ -74,7 +74,7 @@ def test_rclpy_reads_each_message_that_is_written(kind: Any) -> None:
 
 
 def test_a_nested_message_is_written_at_each_offset() -> None:
-    """Its form is remembered for each alignment, because the gaps in it differ."""
+    """Its form is cached for each alignment, because the gaps in it differ."""
     restart = filled(msg.RestartPolicy, random.Random(1))
     for letters in range(9):
         spec = msg.ProcessSpec(kind="x" * letters, restart=restart)

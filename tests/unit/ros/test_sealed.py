@@ -199,7 +199,7 @@ class Follower:
 
 @pytest.mark.parametrize("field", ["run", "signature"])
 def test_a_beat_with_a_field_of_another_length_is_dropped(field: str) -> None:
-    """A signature covers the bytes of run and body, and not where one ends."""
+    """The signed bytes do not contain the lengths of run and body."""
     follower, whole = Follower(), {"run": RUN, "signature": array("B", bytes(SIGNATURE_BYTES))}
     body = array("B", serialize_message(msg.MasterBeat(beat=1)))
     for number, length in enumerate((0, 1, len(whole[field]) - 1, len(whole[field]) + 1), 1):

@@ -43,7 +43,7 @@ def test_a_message_that_ends_early_or_claims_too_much_is_malformed() -> None:
 
 @pytest.mark.parametrize(("run", "receiver_run"), [(0, 16), (15, 17), (17, 15), (16, 0)])
 def test_a_message_with_a_run_of_another_length_is_malformed(run: int, receiver_run: int) -> None:
-    """Otherwise a run would have bytes of the next field."""
+    """Otherwise a run would contain bytes of the next field."""
     message = msg.Sealed(run=array("B", bytes(run)), receiver_run=array("B", bytes(receiver_run)))
     assert decode(serialize_message(message)) is None
 

@@ -282,7 +282,7 @@ def test_starts_and_growth_are_noted(tmp_path, keeper) -> None:
 
 
 def test_a_program_without_output_needs_no_index(tmp_path, keeper) -> None:
-    """Most files that a short job would leave are not made."""
+    """A short job without output leaves only one file."""
     start(keeper, 7)
     keeper.look(1e9)
     keeper.release((P.process, P.number))
@@ -290,7 +290,7 @@ def test_a_program_without_output_needs_no_index(tmp_path, keeper) -> None:
 
 
 def test_a_start_is_known_before_the_first_look(tmp_path, keeper) -> None:
-    """A reader who is faster than the supervisor learns where the output of a program begins."""
+    """Before the supervisor creates the index, a reader gets the mark of the program's start."""
     before = time.time() - 1.0  # the kernel stamps files with a coarse clock
     start(keeper, 7, b"hello\n")
     (when, *first), *_ = read(tmp_path, pid=7).marks

@@ -170,7 +170,7 @@ def test_a_group_added_to_a_running_instance_waits_for_no_removal(tmp_path: Path
 
 @pytest.fixture
 def unmoved(tmp_path: Path) -> InstanceGroups:
-    """Return the groups of an instance with two processes, which only memory limits so far."""
+    """Return the groups of an instance with two processes, so far only with a memory group."""
     (tmp_path / "cgroup.procs").touch()
     trees = [Tree(1, str(tmp_path / name), str(tmp_path), (name,)) for name in ("memory", "cpu")]
     groups = InstanceGroups(trees)

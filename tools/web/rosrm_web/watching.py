@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Seconds between two requests to the master.
 PERIOD: Final = 0.1
-#: Seconds; two events of one sequence with times closer than this are one event.
+#: Most seconds between the times of two copies of one event, which have the same sequence.
 _SAME: Final = 0.001
 #: Most new events of one request; if there are more, the oldest are left out.
 MOST_EVENTS: Final = 1000
@@ -109,7 +109,7 @@ class Watcher:
                 _log.exception("a part of the gateway cannot read new events")
 
     def _is_other(self, event: EventRow) -> bool:
-        """Return True if the last known event differs, because a new journal has overtaken it."""
+        """Return True if an event is not the last known one, so that the journal is new."""
         return self._written > 0.0 and abs(event.wall_time - self._written) > _SAME
 
     def _list(self, client: Client) -> Listing:

@@ -301,7 +301,7 @@ def _stop_silent_destination(state: MasterState, migration: Migration, now: floa
 
 
 def newest_reports(migration: Migration) -> str:
-    """Return the newest report of source and destination: what a phase waits for."""
+    """Return the newest reports of source and destination, which say what a phase waits for."""
     if not migration.handoff_reports:
         return (
             "neither node has reported. Do they use rosrm.node? A node that meets only the "

@@ -149,7 +149,7 @@ def _restore_instances(
 
 
 def _has_run(state: MasterState, process: Process, now: float) -> bool:
-    """Return True if the owner of a process has run for so long that the readings show its load."""
+    """Return True if the owner of a process has run long enough that readings show its load."""
     return process.phase is ProcessPhase.RUNNING and now - process.since >= state.settings.settle
 
 

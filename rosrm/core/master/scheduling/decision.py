@@ -64,7 +64,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The part of one policy in a decision.
+    """Scores and reasons of one policy in a decision.
 
     Attributes:
         scores: None: the policy failed.
@@ -93,9 +93,11 @@ class Moment:
     standing: tuple[Refusal | None, ...]
 
     def parts(self, refused: Sequence[Refusal | None]) -> list[Part]:
-        """Return the scores of each policy again, with its reasons (a policy is pure).
+        """Compute the scores of each policy again (a policy is pure), with its reasons.
 
-        `refused`: for each host the filter that it failed, so that a veto needs no reason.
+        Args:
+            refused: for each host the filter that refuses it, or None. A veto on a host that a
+                filter refuses needs no reason.
         """
         if not len(self.hosts):
             return []
@@ -115,7 +117,7 @@ class Moment:
     def _reasons(
         self, link: ScoringLink, scores: Scores, hook: str, rows: Sequence[int]
     ) -> dict[int, str]:
-        """Return the policy's own reasons, asked in one guarded call; a note if that failed."""
+        """Ask a policy for its reasons in one guarded call; return a note if that call fails."""
         ask = getattr(scores, hook)
 
         def reasons() -> dict[int, str]:

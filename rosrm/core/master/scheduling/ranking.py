@@ -257,11 +257,11 @@ class Ranking:
     def _candidates(self, columns: Columns, more: IntArray | None = None) -> Candidates:
         """Return some hosts with the demand; `more` as in `candidates`.
 
-        Those of all hosts are kept, because their arrays are those of the table.
+        The candidates of all hosts are kept, because their arrays are views of the table.
         """
         if columns is not self._every:
             return candidates(self.table, self.demand, self.need, columns, more)
-        if self._all is None or self.demand.spec.devices:  # whose counts are not in the table
+        if self._all is None or self.demand.spec.devices:  # their counts are not in it
             self._all = candidates(self.table, self.demand, self.need, columns)
         return self._all
 

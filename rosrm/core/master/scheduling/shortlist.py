@@ -12,11 +12,11 @@ from rosrm.core.master.state.host_arrays import FloatArray
 
 #: Number of columns that a caller gets: the best one, and the runners-up in an explanation.
 WANTED: Final = 4
-#: Number of columns that a search finds once values change one by one, to need fewer searches.
+#: Number of columns that a search finds after single values have changed, to need fewer searches.
 _AHEAD: Final = 8
 #: Number of changed values, or of columns in the list, above which a new search costs less.
 MOST: Final = 12
-#: Comes after each finite value.
+#: Sorts after each finite value.
 _NONE: Final = (inf, -1)
 
 

@@ -444,7 +444,7 @@ class HostTable(HostColumns):
         return wanted[self.condition]  # much faster than np.isin
 
     def any_having(self, conditions: Sequence[HostCondition]) -> bool:
-        """Return True if a host has one of some conditions; fast if all hosts are up."""
+        """Return True if any host is in one of these conditions; fast if all hosts are up."""
         if not np.count_nonzero(self.condition):  # UP is 0
             return len(self) > 0 and HostCondition.UP in conditions
         return bool(self.having(conditions).any())

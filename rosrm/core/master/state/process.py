@@ -256,7 +256,7 @@ class Process:
             soon as the conditions of its start order hold.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
         demand: its demand, with the version of the learned needs in it.
-        name: the name in each of its specs.
+        name: its name, the same in each of its specs.
         node: phrase for the node that it adds to the ROS graph (`node_of`).
     """
 

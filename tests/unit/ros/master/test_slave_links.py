@@ -106,7 +106,7 @@ def test_discovery_is_asked_once_for_each_registration(links, control):
 
 
 def test_discovery_is_asked_again_after_a_silence(links, control):
-    """DDS may have forgotten the slave, which still receives the beats and registers no more."""
+    """DDS may have removed the slave, which still receives beats and does not register again."""
     links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
     receive_reading(links, beat=100, sequence=1)
     links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
@@ -120,7 +120,7 @@ def test_discovery_is_asked_again_after_a_silence(links, control):
 
 
 def test_an_order_long_after_the_registration_does_not_ask_discovery(links, control):
-    """The question takes milliseconds with a thousand hosts, and no longer changes the outcome."""
+    """The check takes milliseconds with a thousand hosts, and the order is sent in any case."""
     control.ready = False
     links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
     receive_reading(links, beat=100, sequence=1)

@@ -204,7 +204,7 @@ def test_of_two_masters_the_running_one_is_kept(slave) -> None:
 
 
 def test_a_handshake_with_a_killed_master_is_soon_repeated(slave) -> None:
-    """Its service looks ready for two minutes, and the next master never receives the request."""
+    """The killed master looks ready for two minutes; the next one never receives the request."""
     slave.join(Master(slave, 11))
     new = Master(slave, 12, epoch=2, pid=8)
     slave.pass_time(0.8, new)

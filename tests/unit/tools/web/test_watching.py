@@ -70,7 +70,7 @@ class Journal(Master):
 
 
 def test_a_new_journal_that_has_overtaken_the_old_one_is_noticed():
-    """Its last sequence alone would hide it; all its events are new."""
+    """The last sequence alone does not show it. All events of the new journal are reported."""
 
     async def scene() -> None:
         journal = Journal()
