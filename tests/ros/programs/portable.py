@@ -94,4 +94,5 @@ if __name__ == "__main__":
     run_portable(
         Brain,
         executor=MultiThreadedExecutor if FAULT == "threads" else SingleThreadedExecutor,
+        patience=20.0,  # peers are found late on a busy machine
     )
