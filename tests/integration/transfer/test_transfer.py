@@ -81,8 +81,9 @@ def test_a_wrong_token_is_refused_and_the_right_one_still_works(offer, source, t
     assert digests(target) == digests(source)
 
 
-def test_an_offer_is_taken_once(offer, target, tmp_path, destination):
+def test_an_offer_is_taken_once(offer, sender, target, tmp_path, destination):
     destination.fetch(offer, target)
+    assert sender.wait(PATIENCE).outcome == "taken"
     with pytest.raises(TransferError, match=r"cannot be reached: .*its offer.* may be over"):
         destination.fetch(offer, tmp_path / "second")
 
