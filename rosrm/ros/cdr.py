@@ -28,7 +28,6 @@ from rosrm_msgs import msg
 _HEADER: Final = b"\x00\x01"
 _HEADER_BYTES: Final = 4
 _LENGTH: Final = struct.Struct("<I").unpack_from
-_PACK_LENGTH: Final = struct.Struct("<I").pack
 #: Largest alignment in CDR.
 _ALIGNMENT: Final = 8
 #: Forms of one nested message that are kept for each alignment, and most bytes of one.
@@ -275,9 +274,9 @@ def _caching(write_new: _Writer) -> _Writer:
 
 def _write_text(text: str, parts: list[bytes], at: int) -> int:
     form = text.encode() + b"\0"
-    gap = -at % 4
-    parts.append(bytes(gap) + _PACK_LENGTH(len(form)) + form)
-    return at + gap + 4 + len(form)
+    at = _write_count(len(form), parts, at)
+    parts.append(form)
+    return at + len(form)
 
 
 def _number_writer(code: str) -> _Writer:
@@ -290,6 +289,10 @@ def _number_writer(code: str) -> _Writer:
         return at + gap + size
 
     return write_number
+
+
+#: Writes the count of a sequence, and the length of a text.
+_write_count: Final = _number_writer("I")
 
 
 def _sequence_writer(inner: str) -> _Writer:
@@ -310,12 +313,6 @@ def _sequence_writer(inner: str) -> _Writer:
         return at
 
     return write_sequence
-
-
-def _write_count(count: int, parts: list[bytes], at: int) -> int:
-    gap = -at % 4
-    parts.append(bytes(gap) + _PACK_LENGTH(count))
-    return at + gap + 4
 
 
 def _numbers_writer(code: str) -> _Writer:
