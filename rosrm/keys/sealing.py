@@ -73,7 +73,7 @@ def _nonce(counter: int) -> bytes:
 def _check_key(key: bytes) -> None:
     """Raise `ValueError` for a key of another length; libsodium would read beyond its end."""
     if len(key) != KEY_BYTES:
-        raise ValueError(f"a key has {KEY_BYTES} bytes, this one has {len(key)}")
+        raise ValueError(f"a key must have {KEY_BYTES} bytes, this one has {len(key)}")
 
 
 @dataclass(slots=True)

@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from rosrm import Client, NoMaster
+from rosrm.keys.key_files import key_home, make_secret
 from rosrm.ros.master_connection import MasterClient
 from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import claim_domain
@@ -35,6 +36,7 @@ def test_the_examples_of_the_page_do_what_the_page_shows(make_cluster, tmp_path,
 def test_a_client_without_a_master_says_so_within_its_time_out():
     """The error names the searched domain."""
     domain, claim = claim_domain()
+    make_secret(key_home())
 
     def connect() -> None:
         with pytest.raises(NoMaster, match=rf"no master answered within .*domain {domain}, "):

@@ -74,7 +74,7 @@ def test_a_counter_out_of_range_does_not_open(counter: int) -> None:
 @pytest.mark.parametrize("part", [Sealer, Opener])
 def test_a_key_of_another_length_is_refused(part: type) -> None:
     """A shorter key would make libsodium read beyond its end."""
-    with pytest.raises(ValueError, match="a key has 32 bytes, this one has 31"):
+    with pytest.raises(ValueError, match="a key must have 32 bytes, this one has 31"):
         part(bytes(31))
 
 
