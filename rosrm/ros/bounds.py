@@ -13,8 +13,8 @@ from functools import cache
 from typing import Any, Final, NamedTuple
 
 from rosrm.errors import Refused
+from rosrm.model.remembered import remembered
 from rosrm.ros import sealed_codec
-from rosrm.ros.remembered import remembered
 from rosrm_msgs import msg
 
 #: Most letters of a text, and most entries of a sequence.

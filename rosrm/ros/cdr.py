@@ -21,7 +21,7 @@ from typing import Any, Final
 
 from rclpy.serialization import serialize_message
 
-from rosrm.ros.remembered import remembered
+from rosrm.model.remembered import remembered
 from rosrm_msgs import msg
 
 #: Encapsulation that this module reads: little-endian plain CDR, no options.

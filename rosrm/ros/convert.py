@@ -41,11 +41,11 @@ from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.modes import Mode, Trigger
 from rosrm.model.parameters import pattern_fault
+from rosrm.model.remembered import remembered
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.secret_rules import secrets_fault
 from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
 from rosrm.ros.cdr import made
-from rosrm.ros.remembered import remembered
 from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
 

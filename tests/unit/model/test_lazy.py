@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
-from rosrm.model.lazy import Lazy, mapping_to_json
+from rosrm.model.codec import to_json, to_plain
+from rosrm.model.lazy import Lazy, Plain, mapping_to_json
+from rosrm.model.values import Kind, ProcessSpec, StopPolicy
 
 
 class Counted(Lazy):
@@ -36,3 +38,14 @@ def test_a_lazy_value_is_rendered_once() -> None:
     assert mapping_to_json({"spec": lazy}) == mapping_to_json({"spec": lazy})
     assert lazy["limits"] == {"cpu": 0.5}
     assert lazy.count == 1
+
+
+def test_the_text_of_a_spec_is_its_plain_form() -> None:
+    """Specs share the text of an equal policy, and differ in the policies of their own."""
+    shared = StopPolicy(interrupt_grace=1.5)
+    for spec in (
+        ProcessSpec("talker", stop=shared, environment={"A": 'with "quotes"'}),
+        ProcessSpec("listener", stop=shared, needs={"cpu": 0.5}),
+        ProcessSpec("other", stop=StopPolicy(interrupt_grace=2.5), kind=Kind.JOB),
+    ):
+        assert json.loads(Plain(spec).text) == json.loads(to_json(to_plain(spec)))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from rosrm.core.master.scheduling.filters import (
 from rosrm.core.master.scheduling.host_views import host_view, process_view
 from rosrm.core.master.scheduling.proximity import unmet
 from rosrm.core.master.scheduling.ranking import Ranking
-from rosrm.core.master.state.host_arrays import TIE, FloatArray
+from rosrm.core.master.state.host_arrays import TIE
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Scores
 from rosrm.extensions.placement import ScoringLink
@@ -83,13 +84,13 @@ class Moment:
     Attributes:
         judges: the scoring policies that decided.
         hosts: with copies of all that assignments change.
-        value: (n,) score plus tie-break; inf where the host did not fit.
+        value: score plus tie-break of each host; inf where the host did not fit.
         standing: for each host the first failed filter that assignments do not change.
     """
 
     judges: tuple[ScoringLink, ...]
     hosts: Candidates
-    value: FloatArray
+    value: list[float]
     standing: tuple[Refusal | None, ...]
 
     def parts(self, refused: Sequence[Refusal | None]) -> list[Part]:
@@ -101,9 +102,8 @@ class Moment:
         """
         if not len(self.hosts):
             return []
-        fits = (self.value < np.inf).tolist()
-        scored = [at for at, fit in enumerate(fits) if fit]
-        others = [at for at, fit in enumerate(fits) if not fit and refused[at] is None]
+        scored = [at for at, value in enumerate(self.value) if value < inf]
+        others = [at for at, value in enumerate(self.value) if value == inf and refused[at] is None]
         return [self._part(link, scored, others) for link in self.judges]
 
     def _part(self, link: ScoringLink, scored: Sequence[int], others: Sequence[int]) -> Part:
@@ -134,7 +134,9 @@ class Moment:
         return self.hosts.demand.plugins.calls
 
     def refusals(self) -> list[Refusal | None]:
-        """Return for each host the first filter that it failed."""
+        """Return for each host the first filter that it failed; a host that fits failed none."""
+        if inf not in self.value:
+            return [None] * len(self.value)
         changing = refusals(BY_ASSIGNMENT, self.hosts)
         return [first_of(*both) for both in zip(self.standing, changing, strict=True)]
 
@@ -194,7 +196,7 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     first = [host.column for host in listed[:_NAMED_HOSTS]] if column < 0 else ranking.lowest()
     moment = _moment(ranking, _first(column, first))
     named, fitting = len(moment.value), ranking.fitting()
-    named_fitting = named - moment.value.tolist().count(np.inf)
+    named_fitting = named - moment.value.count(inf)
     omitted = {
         "would take it at a higher score": fitting - named_fitting,
         "cannot take it now": len(listed) - fitting - (named - named_fitting),
@@ -238,9 +240,8 @@ def _moment(ranking: Ranking, columns: list[int]) -> Moment:
     at = np.array(columns, np.int64)
     hosts = candidates(ranking.table, ranking.demand, ranking.need, at)
     hosts.known_flows = ranking.flows(at)
-    value = ranking.value[at]
-    some_fail = np.inf in value.tolist()
-    standing = ranking.standing_refusals(columns) if some_fail else (None,) * len(columns)
+    value: list[float] = ranking.value[at].tolist()
+    standing = ranking.standing_refusals(columns) if inf in value else (None,) * len(columns)
     if ranking.reads_tenants:
         hosts.keep_tenants()
     return Moment(ranking.judges, hosts, value, standing)
@@ -259,8 +260,8 @@ def _verdicts(moment: Moment, *, chosen: bool) -> tuple[Verdict, ...]:
 def _verdict(
     moment: Moment, parts: Sequence[Part], refused: Refusal | None, at: int, *, chosen: bool
 ) -> Verdict:
-    name, value = moment.hosts.host(at).name, float(moment.value[at])
-    if value < np.inf:
+    name, value = moment.hosts.host(at).name, moment.value[at]
+    if value < inf:
         score = value - TIE * float(moment.hosts.processes[at])
         reason = "; ".join(filter(None, (_sum(parts, at), unmet(moment.hosts, at))))
         return Verdict(name, "chosen" if chosen else "fits", score, reason)

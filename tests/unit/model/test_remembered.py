@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rosrm.ros.remembered import remembered
+from rosrm.model.remembered import remembered
 
 
 def test_a_result_is_that_of_this_very_object() -> None:
