@@ -30,6 +30,7 @@ from rclpy.utilities import remove_ros_args
 from rosrm.node.component_links import ComponentLinks
 from rosrm.node.identity import made_for
 from rosrm.ros.fast_dds import announcing
+from rosrm.ros.peer_announcements import request_announcements
 
 try:
     from composition_interfaces.srv import ListNodes, LoadNode, UnloadNode
@@ -190,6 +191,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     executor = SingleThreadedExecutor()
     with announcing(os.environ, "steady", udp=False):  # as for a migratable node
         container = Container(executor, _own_name(remove_ros_args(words)[1:]))
+    request_announcements(rclpy.get_default_context().get_domain_id(), os.environ)
     try:
         with suppress(KeyboardInterrupt, ExternalShutdownException):  # the usual ends of a node
             executor.spin()

@@ -14,6 +14,7 @@ from rosrm.node.entities import ServiceOf
 from rosrm.node.handoff.session import HandoffSession
 from rosrm.node.identity import NodeIdentity, own_identity
 from rosrm.ros.fast_dds import announcing
+from rosrm.ros.peer_announcements import request_announcements
 
 if TYPE_CHECKING:
     _Base = Any
@@ -50,6 +51,7 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
         with contextlib.nullcontext() if identity is None else profile:
             super().__init__(*arguments, **named)
         if self._rosrm is not None:
+            request_announcements(self.context.get_domain_id(), os.environ)
             self._rosrm.begin()
 
     def _be_the_only_one(self, identity: NodeIdentity) -> None:
