@@ -14,7 +14,6 @@ import re
 import shutil
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
-from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
@@ -56,6 +55,8 @@ class Incoming:
         self.artifact = artifact
         self.path = path
         self._file = open_private(str(path), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        from hashlib import sha256  # noqa: PLC0415 - OpenSSL, 1 MiB, only where artifacts are used
+
         self._digest: Any = sha256()
 
     def write(self, data: bytes) -> None:

@@ -6,7 +6,6 @@ closes its half to have the node destroyed; its end closes the connection, too.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import socket
@@ -37,8 +36,10 @@ def address(container: str, environment: Mapping[str, str]) -> str:
         container: name of the container on its host.
         environment: of the container or of a component's process.
     """
+    from hashlib import sha256  # noqa: PLC0415 - OpenSSL, 1 MiB, only where components are used
+
     place = [str(os.getuid()), *(environment.get(name, "") for name in _PLACE), container]
-    digest = hashlib.sha256(json.dumps(place).encode()).hexdigest()
+    digest = sha256(json.dumps(place).encode()).hexdigest()
     return f"\0rosrm-container-{digest[:32]}"
 
 

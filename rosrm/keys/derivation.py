@@ -6,9 +6,10 @@ neither the key from which it is derived, nor other keys derived from that key.
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from typing import Final
+
+from rosrm.keys.hashing import digest_of
 
 #: Bytes of every secret key.
 KEY_BYTES: Final = 32
@@ -26,12 +27,9 @@ def derived(key: bytes, purpose: str, *arguments: str | int | bytes) -> bytes:
         arguments: further values that distinguish the key. Each is preceded by its length, so that
             no two lists of arguments give the same bytes. A number has 64 bits.
     """
-    state = hashlib.blake2b(key=key, digest_size=KEY_BYTES, person=_PERSON)
-    for argument in (purpose, *arguments):
-        part = _bytes_of(argument)
-        state.update(struct.pack("<I", len(part)))
-        state.update(part)
-    return state.digest()
+    parts = [_bytes_of(argument) for argument in (purpose, *arguments)]
+    content = b"".join(struct.pack("<I", len(part)) + part for part in parts)
+    return digest_of(content, KEY_BYTES, _PERSON, key)
 
 
 def _bytes_of(argument: str | int | bytes) -> bytes:

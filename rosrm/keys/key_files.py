@@ -10,7 +10,6 @@ import base64
 import contextlib
 import fcntl
 import os
-import secrets
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -130,6 +129,8 @@ def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
     Raises:
         ConfigError: the file is invalid, others can read it, or it cannot be written.
     """
+    import secrets  # noqa: PLC0415 - OpenSSL, which a slave does not need
+
     with _locked(home):
         others = [one for one in _all_grants(home) if one[0].principal != principal]
         # The generation is random, because a counter would repeat that of a revoked key after the

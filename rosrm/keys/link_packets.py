@@ -9,11 +9,11 @@ is sent again yields one more echo of the same size, which the probing slave ign
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import struct
 from collections.abc import Callable
 from typing import Final, NamedTuple
+
+from rosrm.keys.hashing import are_equal, digest_of
 
 #: Bytes of the random number of a probe.
 NONCE_BYTES: Final = 16
@@ -67,7 +67,7 @@ def opened(data: bytes, key_of: Callable[[Packet], bytes | None]) -> Packet | No
         return None
     packet = Packet(kind == _ECHO, host_id, nonce, wait)
     key = key_of(packet)
-    if key is None or not hmac.compare_digest(_tag(key, data[:-_TAG_BYTES]), data[-_TAG_BYTES:]):
+    if key is None or not are_equal(_tag(key, data[:-_TAG_BYTES]), data[-_TAG_BYTES:]):
         return None
     return packet
 
@@ -77,4 +77,4 @@ def _tagged(key: bytes, content: bytes) -> bytes:
 
 
 def _tag(key: bytes, content: bytes) -> bytes:
-    return hashlib.blake2b(content, key=key, digest_size=_TAG_BYTES, person=_PERSON).digest()
+    return digest_of(content, _TAG_BYTES, _PERSON, key)

@@ -9,7 +9,6 @@ counter is not above the counter of the newest message.
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from dataclasses import dataclass, field
 from enum import Enum
@@ -22,6 +21,7 @@ from nacl._sodium import ffi, lib
 from nacl.bindings import crypto_aead_chacha20poly1305_ietf_KEYBYTES as KEY_BYTES
 
 from rosrm.keys.derivation import derived
+from rosrm.keys.hashing import digest_of
 
 #: Version of the sealing, unencrypted in each message.
 FORMAT: Final = 1
@@ -51,7 +51,7 @@ def channel_of(name: str, type_name: str) -> bytes:
             are two channels.
     """
     text = f"{name}\0{type_name}".encode()
-    return hashlib.blake2b(text, digest_size=16, person=b"rosrm channel").digest()
+    return digest_of(text, 16, b"rosrm channel")
 
 
 def channel_key(principal_key: bytes, direction: Direction, run: bytes, channel: bytes) -> bytes:

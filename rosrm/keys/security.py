@@ -7,7 +7,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from hashlib import blake2b
 from typing import Final, Protocol
 
 from nacl.bindings import crypto_sign, crypto_sign_open
@@ -17,6 +16,7 @@ from rosrm.errors import ConfigError
 from rosrm.keys.cluster import ClusterSecret, PrincipalKey, Principals, own_grant
 from rosrm.keys.derivation import derived
 from rosrm.keys.handoffs import HandoffKeys, instance_key, new_link
+from rosrm.keys.hashing import digest_of
 from rosrm.keys.links import KeyedLink, Link, OpenLink
 from rosrm.keys.roles import Grant, Principal, Role, principal_of
 from rosrm.keys.sealing import RUN_BYTES, Direction
@@ -463,7 +463,7 @@ def _tag(content: bytes, master: bytes) -> bytes:
     key cannot use up their CPU time with forged messages. Every slave or client with a key could
     forge the tag, but not the signature.
     """
-    return blake2b(content, key=master, digest_size=_TAG_BYTES, person=_TAG_PERSON).digest()
+    return digest_of(content, _TAG_BYTES, _TAG_PERSON, master)
 
 
 def _is_signed(content: bytes, signature: bytes, key: bytes) -> bool:

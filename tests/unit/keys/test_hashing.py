@@ -1,0 +1,15 @@
+"""BLAKE2b by libsodium."""
+
+import hashlib
+
+import pytest
+
+from rosrm.keys.hashing import digest_of
+
+
+@pytest.mark.parametrize("key", [b"", bytes(range(32))])
+@pytest.mark.parametrize("content", [b"", b"content", bytes(1000)])
+def test_a_digest_is_that_of_hashlib(content, key) -> None:
+    """Parts of another version compute the same keys, tags and channels."""
+    by_hashlib = hashlib.blake2b(content, digest_size=16, person=b"a use", key=key)
+    assert digest_of(content, 16, b"a use", key) == by_hashlib.digest()
