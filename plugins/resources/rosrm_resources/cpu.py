@@ -7,15 +7,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-from annotated_types import Gt, Le
-
-from rosrm import ProbeContext, Sessions
+from rosrm import PositiveSeconds, ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
-from rosrm_resources.rate import Rate
+from rosrm_resources.rate import Rate, check_window
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 #: Seconds by which `Sessions.pids` may lag; the CPU time of a new pid may cover as much time.
@@ -36,11 +34,12 @@ class CpuOptions:
     """
 
     scope: Scope | None = None
-    window: Annotated[float, Gt(0), Le(60)] = 1.0
+    window: PositiveSeconds = 1.0
     group: str | None = None
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` if a group is given with a scope other than "cgroup"."""
+        """Raise `ValueError` for a long window, or a group with a scope other than "cgroup"."""
+        check_window(self.window)
         check_group(self.group, self.scope)
 
 

@@ -7,11 +7,9 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Final
 
-from annotated_types import Gt
-
-from rosrm import ProbeContext, Sessions
+from rosrm import PositiveSeconds, ProbeContext, Sessions
 from rosrm_resources.cgroups import lines_of
 from rosrm_resources.gauge import GaugeProbe, Scope, budget
 
@@ -36,7 +34,7 @@ class DiskOptions:
 
     scope: Scope | None = None
     path: str | None = None
-    walk_period: Annotated[float, Gt(0)] = 5.0
+    walk_period: PositiveSeconds = 5.0
 
 
 def create(options: DiskOptions, context: ProbeContext) -> GaugeProbe:

@@ -10,13 +10,12 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
-
-from annotated_types import Ge
+from typing import Any, Final, Literal
 
 from rosrm import (
     Accounting,
     ConfigError,
+    Count,
     Device,
     ProbeContext,
     Reading,
@@ -40,7 +39,7 @@ class GpuOptions:
             them. "mean": for processes that use all GPUs; the capacity is the sum.
     """
 
-    devices: tuple[Annotated[int, Ge(0)], ...] = ()
+    devices: tuple[Count, ...] = ()
     combine: Literal["max", "mean"] = "max"
 
 

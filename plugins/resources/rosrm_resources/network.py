@@ -6,12 +6,17 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
-from annotated_types import Gt, Le
-
-from rosrm import ConfigError, ProbeContext, Reading, ResourceDescription, SkipPlugin
-from rosrm_resources.rate import Rate
+from rosrm import (
+    ConfigError,
+    PositiveSeconds,
+    ProbeContext,
+    Reading,
+    ResourceDescription,
+    SkipPlugin,
+)
+from rosrm_resources.rate import Rate, check_window
 
 _BYTES_PER_MEGABIT: Final = 1e6 / 8
 
@@ -28,8 +33,14 @@ class NetworkOptions:
     """
 
     interfaces: tuple[str, ...] = ()
-    capacity: Annotated[float, Gt(0)] | None = None
-    window: Annotated[float, Gt(0), Le(60)] = 2.0
+    capacity: float | None = None
+    window: PositiveSeconds = 2.0
+
+    def __post_init__(self) -> None:
+        """Raise `ValueError` for a capacity or a window that is out of range."""
+        if self.capacity is not None and not self.capacity > 0.0:
+            raise ValueError(f"capacity {self.capacity!r} is not greater than 0")
+        check_window(self.window)
 
 
 def create(options: NetworkOptions, _context: ProbeContext) -> NetworkProbe:

@@ -9,6 +9,14 @@ from typing import Final
 #: Shortest interval in seconds. The kernel counts CPU time in steps of 10 ms, so a rate over less
 #: time is noise.
 _SHORTEST: Final = 0.02
+#: Longest window in seconds.
+_LONGEST: Final = 60.0
+
+
+def check_window(window: float) -> None:
+    """Raise `ValueError` for a window that is too long."""
+    if window > _LONGEST:
+        raise ValueError(f"`window` is {window:g} s; at most {_LONGEST:g} s")
 
 
 class Rate:
