@@ -52,6 +52,7 @@ class InstanceGroups:
         self._unset: dict[Key, dict[str, Any]] = {}  # limits that could not be set at the start
         self._kills_before: dict[Key, int] = {}
         self._emptied: dict[str, float] = {}
+        self._homes: dict[str, int] = {}  # descriptors of the files by which this thread returns
         self._unfinished: dict[Key, set[Tree]] = {}  # groups that some processes did not enter
 
     def find_again(self, live: Mapping[Key, int]) -> None:
@@ -184,9 +185,19 @@ class InstanceGroups:
                     left.callback(os.close, group)
                 else:
                     # A thread that moves itself alone needs no grace period; this is the only one.
-                    left.callback(_return, tree.home)
+                    left.callback(self._return, tree.home)
                     _enter(path)
             yield group
+
+    def _return(self, home: str) -> None:
+        """Move this thread back; an error must not hide that the instance was started."""
+        try:
+            if home not in self._homes:
+                tasks = os.path.join(home, "tasks")
+                self._homes[home] = os.open(tasks, os.O_WRONLY | os.O_CLOEXEC)
+            os.write(self._homes[home], b"0")
+        except OSError as error:
+            own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
 
     def members(self, key: Key) -> list[int] | None:
         """Return the pids of all processes of an instance; None: it has no group."""
@@ -418,14 +429,6 @@ def _move_all(source: str, target: str) -> None:
 def _enter(path: str) -> None:
     """Move this thread into a group of version 1. Raises OSError."""
     cgroups.write(os.path.join(path, "tasks"), "0")
-
-
-def _return(home: str) -> None:
-    """Move this thread back; an error must not hide that the instance was started."""
-    try:
-        _enter(home)
-    except OSError as error:
-        own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
 
 
 def _number(path: str) -> float:

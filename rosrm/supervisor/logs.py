@@ -228,6 +228,7 @@ class LogFolder:
     def __init__(self, state: str) -> None:
         self._state = state
         self._numbers: dict[str, list[int]] = {}
+        self._left = 0  # processes after the last removal
         found = map(paths.log_number, os.listdir(paths.log_folder(state)))
         for name, number in sorted(filter(None, found), key=lambda log: log[1]):
             self._place(name, number)
@@ -243,13 +244,16 @@ class LogFolder:
 
     def remove_old_processes(self, known: Iterable[Key], limits: LogLimits) -> None:
         """Remove the logs of the processes started longest ago, once the excess is large enough."""
-        excess = len(self._numbers) - limits.processes
-        if excess < PROCESSES_AT_ONCE:
+        processes = len(self._numbers)
+        excess = processes - limits.processes
+        # Known ones stay. So without this bound, each start would look at all of them.
+        if excess < PROCESSES_AT_ONCE or processes < self._left + PROCESSES_AT_ONCE:
             return
         stay = {paths.safe_name(process) for process, _ in known}
         for name in [name for name in self._numbers if name not in stay][:excess]:
             for number in self._numbers.pop(name):
                 self._remove(name, number)
+        self._left = len(self._numbers)
 
     def remove_excess(self, running: Iterable[Key], keep_bytes: int) -> None:
         """Remove logs until their bytes are within a bound, those of old processes first.

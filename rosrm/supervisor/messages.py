@@ -57,7 +57,8 @@ The supervisor sends messages; the key `tell` names the message:
                                                    secrets: true, for it reads them at each start
                                                    amends: true: it can change limits
                                                    adopts: true: it can adopt processes
-    status       status                            a change, or the answer to a repeated order
+    status       status                            a change, or the answer to a repeated order; not
+                                                   "starting" if the spawn follows at once
     amended      instance, restart, limits,        the amendment is recorded; its status came before
                  refusal                           refusal: "", or why nothing has changed
     refused      message                           the supervisor closes the connection after it

@@ -19,7 +19,7 @@ from typing import Final
 
 from rosrm.core.supervisor import commands, events
 from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
-from rosrm.core.supervisor.instance import STOPPING
+from rosrm.core.supervisor.instance import STARTING, STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.model import start_trace
@@ -87,6 +87,7 @@ class Server:
         self._notes: list[str] = []
         self._spawns: deque[Key] = deque()
         self._unsent: list[bytes] = []
+        self._first_starts: dict[Key, messages.Status] = {}  # unsent statuses before the first run
         self._client: Connection | None = None
         self._served = False
         self._leaving = False
@@ -181,7 +182,13 @@ class Server:
             self._trees.release(key)
             self._groups.remove(key, time.monotonic())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
-        self._unsent.append(messages.encode_status(messages.Status.of(instance)))
+        status = messages.Status.of(instance)
+        # The slave knows that it has ordered a start. Most spawns are in the same round.
+        self._first_starts.pop(key, None)
+        if instance.phase == STARTING and not instance.started:
+            self._first_starts[key] = status
+        else:
+            self._unsent.append(messages.encode_status(status))
 
     def _unspawn(self, key: Key) -> None:
         if key in self._spawns:
@@ -189,8 +196,10 @@ class Server:
             self._happened(SpawnFailed(key, ""))
 
     def _report(self) -> None:
-        unsent = b"".join(self._unsent)
+        starts = map(messages.encode_status, self._first_starts.values())
+        unsent = b"".join([*self._unsent, *starts])
         self._unsent.clear()
+        self._first_starts.clear()
         if self._client is not None and unsent:
             self._send(self._client, unsent)
 
@@ -399,6 +408,7 @@ class Server:
         self._served = True
         self._logs.limits = hello.log
         self._unsent.clear()  # the welcome's statuses hold all of these changes
+        self._first_starts.clear()
         statuses = [messages.Status.of(instance) for instance in self._core.instances.values()]
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         fenced = [one.key for one in self._core.instances.values() if one.fence is not None]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import time
 from collections.abc import Mapping
 from typing import Final
 
@@ -101,11 +102,32 @@ def _enter(directory: str) -> None:
         raise SpawnError(message) from None
 
 
+#: Paths of the programs that were found lately, with the times until which they are used again. A
+#: search makes a system call for each directory of the PATH, and jobs often run one program.
+_found: Final[dict[tuple[str, str], tuple[str, float]]] = {}
+#: Seconds for which a program is not searched for again, and most of them.
+_KEPT_FOR: Final = 1.0
+_MOST_KEPT: Final = 100
+
+
 def find_executable(word: str, environment: Mapping[str, str]) -> str:
     """Return the path of the program that a command's first word names. Raises SpawnError."""
     if "/" in word:
         return word
     search = environment.get("PATH", os.defpath)
+    path, until = _found.get((word, search), ("", 0.0))
+    now = time.monotonic()
+    if now < until and os.access(path, os.X_OK):
+        return path
+    path = _search(word, search)
+    if os.path.isabs(path):  # others depend on the working directory
+        if len(_found) >= _MOST_KEPT:
+            _found.clear()
+        _found[word, search] = path, now + _KEPT_FOR
+    return path
+
+
+def _search(word: str, search: str) -> str:
     reason = f"program {word!r} is not on the PATH"
     for directory in search.split(os.pathsep):
         path = os.path.join(directory or ".", word)

@@ -13,7 +13,7 @@ import pytest
 from rosrm.core.supervisor.events import FailOrdered, StopOrdered
 from rosrm.model.values import InstanceState, RestartPolicy
 from rosrm.runtime import private_files, timer_slack
-from tests.waiting import wait_gone, wait_until
+from tests.waiting import PATIENCE, wait_gone, wait_until
 
 IGNORES_ALL = """
 import signal, time
@@ -235,3 +235,11 @@ def test_a_stopped_process_ends_and_starts_again(host, client, killed):
     found = found or [host.running(client, "hung")]
     assert found[0].pid != pid
     wait_gone(pid)
+
+
+def test_a_start_is_reported_once_its_process_runs(host, client):
+    """The first status of a start that need not wait for other starts has the process."""
+    client.start([host.order("prompt", "sleep", "1000")])
+    status, *others = client.receive(PATIENCE)
+    assert (status.state, others) == (InstanceState.RUNNING, [])
+    assert status.pid > 0
