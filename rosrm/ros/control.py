@@ -19,7 +19,7 @@ from typing import Any, Final
 from rosrm.errors import Refused
 from rosrm.keys.links import Link
 from rosrm.keys.security import Peer
-from rosrm.ros.bounds import MOST_LETTERS, check_bounds
+from rosrm.ros.bounds import MOST_LETTERS
 from rosrm.ros.participant import Participant, failed_response
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
 from rosrm.version import PROTOCOL_VERSION
@@ -238,12 +238,6 @@ class ControlServer:
         self._endpoints.serve(service_type, name, take)
 
 
-def _bounded(response: Any) -> Any:
-    """Return a received response; raise `Refused` for one that exceeds its bounds."""
-    check_bounds(response)
-    return response
-
-
 @dataclass(slots=True)
 class Call:
     """A request without an answer yet.
@@ -294,7 +288,7 @@ class ControlClient:
         if call in self._calls:
             self._calls.remove(call)
             guard = self.participant.guard
-            if guard.call(lambda: call.done(_bounded(call.future.result()))):
+            if guard.call(lambda: call.done(call.future.result())):
                 guard.call(call.done, None)  # an unusable response counts as none
 
     def expire(self, now: float) -> None:

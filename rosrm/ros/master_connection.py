@@ -92,9 +92,7 @@ class _Answers:
     sent: int = 0
 
     def take(self, future: Any) -> None:
-        answer = future.result()
-        check_bounds(answer)
-        self.first = self.first or (answer,)
+        self.first = self.first or (future.result(),)
 
     @property
     def answer(self) -> Any:

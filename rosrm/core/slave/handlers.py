@@ -28,6 +28,10 @@ REMEMBER_END: Final = 60.0
 #: Highest number of tombstones.
 _TOMBSTONES: Final = 10_000
 
+#: Seconds after which a wait is reported: most waits for other starts are shorter, and each report
+#: costs the master as much as that of a start. Far below `delivery_timeout`.
+REPORT_WAIT: Final = 0.5
+
 #: States in which an instance has a process.
 _RUNS: Final = (InstanceState.RUNNING, InstanceState.READY)
 
@@ -70,12 +74,24 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
         state.waiting[instance] = assignment
         state.hold(instance, _waiting(assignment))
     launches = _start_waiting(state, now)
-    held = [state.held[one.instance] for one in event.assignments if one.instance in state.waiting]
+    held = [one.instance for one in event.assignments if one.instance in state.waiting]
     why = state.why_wait() if held else ""
     for one in held:
-        one.status = replace(one.status, message=why)
-    reports = refusals + [one.status for one in held]
-    return [*launches, commands.Report(tuple(reports))] if reports else launches
+        state.held[one].status = replace(state.held[one].status, message=why)
+        state.unreported.setdefault(one, now + REPORT_WAIT)
+    return [*launches, commands.Report(tuple(refusals))] if refusals else launches
+
+
+def _report_waits(state: SlaveState, now: float) -> _Commands:
+    """Report the instances that have waited for a while."""
+    waits = []
+    for instance, due in list(state.unreported.items()):
+        if instance not in state.waiting:
+            del state.unreported[instance]
+        elif now >= due:
+            del state.unreported[instance]
+            waits.append(state.held[instance].status)
+    return [commands.Report(tuple(waits))] if waits else []
 
 
 def _refused(
@@ -446,6 +462,7 @@ def _may_be_discarded(state: SlaveState, held: HeldInstance, now: float) -> bool
 
 def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Commands:
     orders: _Commands = [*fencing.renew_in_time(state, now), *_refuse_late(state, now)]
+    orders += _report_waits(state, now)
     forgotten = []
     for instance, held in state.held.items():
         awaited = held.awaited

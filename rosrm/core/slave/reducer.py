@@ -32,8 +32,8 @@ ComponentLoaded         requests the list again; ends the container as failed if
 LookedAt                ends an instance as failed if it has been unhealthy for too long
 DevicesMissed           ends each running instance as failed that holds a missing device
 TimePassed              stops an instance that is not ready in time, ends one as failed whose
-                        lifecycle transition takes too long, refuses an instance whose fence
-                        expired before its start, and drops old ends
+                        lifecycle transition takes too long, reports one that still waits to
+                        start, refuses one whose fence expired before its start, and drops old ends
 ======================  =========================================================================
 """
 
