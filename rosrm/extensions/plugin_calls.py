@@ -100,11 +100,15 @@ class PluginCalls:
     failing: dict[Plugin, Failing] = field(default_factory=dict)
     _failed: dict[Plugin, Failing] = field(default_factory=dict)
     _worked: set[Plugin] = field(default_factory=set)
+    _running: Plugin | None = None
 
     def ask(
         self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], of: object = None
     ) -> T:
         """Return the answer of a plugin.
+
+        A call within a call of the same plugin has no time-out of its own, because that of the
+        outer one covers it.
 
         Args:
             kind: kind of the offer.
@@ -116,7 +120,7 @@ class PluginCalls:
         Raises:
             PluginError: the call failed; the text has the error and its place.
         """
-        plugin = (kind, name)
+        plugin, outer = (kind, name), self._running
 
         def placed() -> T:
             try:
@@ -124,8 +128,9 @@ class PluginCalls:
             except PluginError as fault:
                 raise PluginError(with_place(fault, of, hook)) from None
 
+        self._running = plugin
         try:
-            answer: T = self.limit(plugin, placed)
+            answer: T = placed() if plugin == outer else self.limit(plugin, placed)
         except KeyboardInterrupt:  # Ctrl-C of a simulation; a master handles the signal itself
             raise
         except BaseException as fault:  # a plugin may raise anything, even SystemExit
@@ -133,6 +138,8 @@ class PluginCalls:
             noted = self._failed.setdefault(plugin, Failing())
             noted.error, noted.count = f"{hook}: {reason}", noted.count + 1
             raise PluginError(reason) from fault
+        finally:
+            self._running = outer
         if plugin in self.failing:
             self._worked.add(plugin)
         return answer

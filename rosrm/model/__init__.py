@@ -19,6 +19,7 @@ requester.py            sender of a request, and its rights on processes
 ros_settings.py         ROS settings of a part: domain, discovery, transports, interface
 codec.py                conversion of values to JSON and back
 lazy.py                 mappings that are rendered and encoded at the first read
+spec_text.py            JSON of a spec
 remembered.py           cache of function results by the identity of the argument
 durations.py            bound of all times
 links.py                measurements of links between hosts

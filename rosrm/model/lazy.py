@@ -4,32 +4,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
-from operator import attrgetter
 from typing import Any, Final
 
-from rosrm.model.codec import fields_to_plain, to_json, to_plain
+from rosrm.model.codec import to_json, to_plain
 from rosrm.model.plan import Plan
-from rosrm.model.remembered import remembered
+from rosrm.model.spec_text import spec_to_json
 from rosrm.model.values import ProcessSpec
 
 #: Types of most values in a mapping. A look-up here takes a fifth of the time of `isinstance`.
-_COMMON: Final = frozenset({str, int, float, bool, type(None), dict, list})
-#: Names of the policies of a spec (its restarts, its limits), which are frozen dataclasses. Those
-#: with a mapping are left out, because a user may change it between two submissions.
-_POLICIES: Final = tuple(
-    one.name for one in fields(ProcessSpec)
-    if is_dataclass(one.default)
-    and not any(isinstance(getattr(one.default, own.name), Mapping) for own in fields(one.default))
-)  # fmt: skip
-_policies_of: Final = attrgetter(*_POLICIES)
-#: Names of its other fields.
-_OTHERS: Final = tuple(one.name for one in fields(ProcessSpec) if one.name not in _POLICIES)
-#: Most bytes of a policy whose text is kept.
-_MOST_KEPT: Final = 4096
-_policy_text: Final = remembered(
-    lambda policy: to_json(to_plain(policy)), lambda text: len(text) <= _MOST_KEPT
-)
+_COMMON: Final = frozenset({str, int, float, bool, type(None), dict, list, tuple})
 
 
 class Lazy(Mapping[str, Any]):
@@ -89,12 +72,9 @@ class Plain(Lazy):
         return plain
 
     def encode(self) -> str:
-        """Return the value as JSON; of a spec, the policies first, each encoded once."""
-        if not isinstance(self._value, ProcessSpec):
-            return super().encode()
-        policies = zip(_POLICIES, _policies_of(self._value), strict=True)
-        texts = ", ".join([f'"{name}": {_policy_text(policy)}' for name, policy in policies])
-        return f"{{{texts}, {to_json(fields_to_plain(self._value, _OTHERS))[1:]}"
+        """Return the value as JSON."""
+        value = self._value
+        return spec_to_json(value) if isinstance(value, ProcessSpec) else super().encode()
 
 
 def mapping_to_json(value: Mapping[str, Any]) -> str:
@@ -106,5 +86,8 @@ def mapping_to_json(value: Mapping[str, Any]) -> str:
     if not lazy:
         return to_json(value)
     texts = ", ".join([f"{to_json(name)}: {item.text}" for name, item in lazy.items()])
-    others = to_json({name: item for name, item in value.items() if name not in lazy})
+    rest = dict(value)
+    for name in lazy:
+        del rest[name]
+    others = to_json(rest)
     return f"{{{texts}{'' if others == '{}' else ', '}{others[1:]}"

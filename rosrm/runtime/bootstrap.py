@@ -153,6 +153,15 @@ def end_start() -> None:
 class LogFormatter(logging.Formatter):
     """Format of log lines without control characters, which messages may have from outside."""
 
+    _second, _time = -1, ""
+
+    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802 - logging's name
+        """Return the time, formatted once a second, because a burst of jobs logs many lines."""
+        second = int(record.created)
+        if second != self._second:
+            self._second, self._time = second, super().formatTime(record, datefmt)
+        return self._time
+
     def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802 - logging's name
         """Return the line; further lines are indented, so that no message looks like two."""
         return super().formatMessage(record).replace("\n", "\n    ")

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from math import isnan
 from types import MappingProxyType
 from typing import Annotated, Final, Literal
 
@@ -101,7 +102,7 @@ class WeightedSum:
             if name in hosts.resources:
                 usage = float(hosts.usage[row, hosts.resources.index(name)])
                 shown = f"{usage:.1%}"
-                if np.isnan(usage):
+                if isnan(usage):
                     shown = f"{self._missing:.1%} (not measured there)"
                 terms.append(f"{weight:g} x {name} {shown}")
         return " + ".join(terms) or "no resource that weighs is read on any host"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,13 @@ import pytest
 
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.plugin_calls import RECORD_PERIOD, WORKS_AFTER, PluginCalls, required
+from rosrm.extensions.plugin_calls import (
+    RECORD_PERIOD,
+    WORKS_AFTER,
+    Plugin,
+    PluginCalls,
+    required,
+)
 from rosrm.model.values import EMPTY, MigrationPolicy, Readiness
 from tests.unit.core.cluster import Cluster, Eq1, StartFirstOrStopFirst, process
 
@@ -105,6 +112,27 @@ def test_a_reason_that_is_no_text_is_named_with_the_place_of_the_method() -> Non
     (host,) = cluster.explain("p1")["decision"]["hosts"]
     place = f"{__file__}:{Refusing.why.__code__.co_firstlineno}"
     assert f"answered None; str is required ({place})" in host["reason"]
+
+
+def test_a_call_within_a_call_of_the_same_plugin_has_no_time_out_of_its_own() -> None:
+    """The outer call's covers it, also after a failure; another plugin has one of its own."""
+    limited: list[Plugin] = []
+
+    def limit(plugin: Plugin, call: Callable[[], Any]) -> Any:
+        limited.append(plugin)
+        return call()
+
+    calls = PluginCalls(limit)
+
+    def outer() -> int:
+        with pytest.raises(PluginError):
+            calls.ask("scoring", "x", "reason", lambda: 1 // 0)
+        calls.ask("filter", "y", "mask", lambda: 1)
+        return calls.ask("scoring", "x", "veto_reason", lambda: 2)
+
+    for _ in range(2):
+        assert calls.ask("scoring", "x", "score", outer) == 2
+    assert limited == [("scoring", "x"), ("filter", "y")] * 2
 
 
 class Wordless(Exception):

@@ -47,5 +47,6 @@ def test_the_text_of_a_spec_is_its_plain_form() -> None:
         ProcessSpec("talker", stop=shared, environment={"A": 'with "quotes"'}),
         ProcessSpec("listener", stop=shared, needs={"cpu": 0.5}),
         ProcessSpec("other", stop=StopPolicy(interrupt_grace=2.5), kind=Kind.JOB),
+        ProcessSpec("", environment={}, time_limit=float(0)),
     ):
         assert json.loads(Plain(spec).text) == json.loads(to_json(to_plain(spec)))

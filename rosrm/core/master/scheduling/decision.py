@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -43,8 +43,7 @@ NO_ROOM: Final = "it has no room"
 DecisionKind = Literal["", "assigned", "set_aside", "waits", "fits", "migrated"]
 
 
-@dataclass(frozen=True, slots=True)
-class Verdict:
+class Verdict(NamedTuple):
     """The verdict on one host.
 
     Attributes:
@@ -63,8 +62,7 @@ class Verdict:
         }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True)
-class Part:
+class Part(NamedTuple):
     """Scores and reasons of one policy in a decision.
 
     Attributes:
@@ -107,12 +105,19 @@ class Moment:
         return [self._part(link, scored, others) for link in self.judges]
 
     def _part(self, link: ScoringLink, scored: Sequence[int], others: Sequence[int]) -> Part:
-        scores = _scores_of(link, self.hosts)
-        if scores is None:
-            return Part(link, None, {})
-        vetoed = [at for at in others if scores.veto is not None and scores.veto[at]]
-        reasons = self._reasons(link, scores, "reason", scored)
-        return Part(link, scores, reasons | self._reasons(link, scores, "veto_reason", vetoed))
+        """Return scores and reasons of a policy, from one call with a time-out."""
+        views = host_view(self.hosts), process_view(self.hosts, link.reads)
+
+        def part() -> Part:
+            scores = required(link.policy.score(*views), Scores)
+            vetoed = [at for at in others if scores.veto is not None and scores.veto[at]]
+            reasons = self._reasons(link, scores, "reason", scored)
+            return Part(link, scores, reasons | self._reasons(link, scores, "veto_reason", vetoed))
+
+        try:
+            return self.plugins.ask("scoring", link.name, "score", part, link.policy)
+        except PluginError as error:  # the decision itself does not need the reasons
+            return Part(link, None, _failed(scored, error))
 
     def _reasons(
         self, link: ScoringLink, scores: Scores, hook: str, rows: Sequence[int]
@@ -126,7 +131,7 @@ class Moment:
         try:
             return self.plugins.ask("scoring", link.name, hook, reasons, scores) if rows else {}
         except PluginError as error:
-            return dict.fromkeys(rows, f"(no reason, because the policy failed: {error})")
+            return _failed(rows, error)
 
     @property
     def plugins(self) -> PluginCalls:
@@ -289,12 +294,6 @@ def _vetoes(parts: Sequence[Part], at: int) -> str:
     return "; ".join(f"{part.link.name}: {part.reasons[at]}" for part in vetoes)
 
 
-def _scores_of(link: ScoringLink, hosts: Candidates) -> Scores | None:
-    views = host_view(hosts), process_view(hosts, link.reads)
-    try:
-        return hosts.demand.plugins.calls.ask(
-            "scoring", link.name, "score", lambda: required(link.policy.score(*views), Scores),
-            link.policy,
-        )  # fmt: skip
-    except PluginError:
-        return None  # the decision itself does not need the reasons
+def _failed(rows: Sequence[int], error: PluginError) -> dict[int, str]:
+    """Return a note instead of the reasons of a policy that has failed."""
+    return dict.fromkeys(rows, f"(no reason, because the policy failed: {error})")

@@ -80,7 +80,7 @@ class Shortlist:
             found.append((lowest, column))
             value[column] = inf  # one more argmin costs less than a sort
         else:
-            self._end = found[-1] if found else _NONE
+            self._end = found[-1] if len(found) < len(value) else _NONE
         for lowest, column in found:
             value[column] = lowest
         return found

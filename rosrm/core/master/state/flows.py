@@ -70,6 +70,8 @@ class Flows:
 
     def remove(self, name: str) -> None:
         """Remove the flows of a process that has ended; what others declare about it stays."""
+        if name not in self.partners:
+            return
         self.declare(name, EMPTY)
         self._set_learned(name, EMPTY)
         for other in list(self.partners.get(name, ())):

@@ -53,6 +53,8 @@ class NeighbourRules:
         self.separated.pop(name, None)
         self.apart_of.pop(name, None)
         rules = self.declared.pop(name, ())
+        if not rules:
+            return
         for other in _named(rules):
             _discard(self.about, other, name)
         for group, strictness in _groups(rules):
