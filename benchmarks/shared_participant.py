@@ -29,7 +29,7 @@ class Berth:
         self.counted = shared.participant.counted
 
     def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
-        """Return a client; an own one only where answers reach many."""
+        """Return a use of a shared client."""
         return self._shared.client(kind, name, qos_profile)
 
     def create_publisher(self, kind: Any, name: str, qos: Any) -> Any:
@@ -152,11 +152,9 @@ class SharedParticipant:
         self._publishers: dict[str, Any] = {}
 
     def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
-        """Return a use of the shared client of a service; a new client for `request_process`."""
+        """Return a use of the shared client of a service."""
         if name not in self._clients:
             made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
-            if name.endswith(f"/{names.REQUEST_PROCESS}"):
-                return made
             self._clients[name] = SharedClient(made)
         return AskingClient(self._clients[name])
 

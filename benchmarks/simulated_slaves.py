@@ -5,10 +5,9 @@ work, statuses) over a real slave's core. Its readings come from a random walk i
 and each instance is reported as running, and then as ended if it is of a job, without a process.
 
 All slaves of a process share one DDS participant, one node, and the entities that are seldom used:
-the clients for handshake, registration and leaving, the publishers of statuses and usages, and the
-reader of `master_beat`. Each has its own key, its own publisher of readings, its own service for
-orders and its own client of `request_process`, because each answer reaches all readers, as in a
-fleet.
+the clients of the master's services, the publishers of statuses and usages, and the reader of
+`master_beat`. Each has its own key, its own publisher of readings and its own service for orders,
+which brings it each single assignment.
 
 The process prints one JSON object when all are registered and accepted. A line on its standard
 input begins a measurement and the next one ends it; then it prints the counts as JSON.
@@ -128,7 +127,7 @@ class SimulatedSlave:
         )  # fmt: skip
         self.endpoint = SlaveEndpoint(endpoints, description, self._state, take=self.take)
         duties = Duties(self.take, *[self._refuse] * (len(fields(Duties)) - 1))
-        SlaveServices(endpoints, duties, name, 5.0, lambda: self.endpoint.epoch)
+        self._services = SlaveServices(endpoints, duties, name, 5.0, self.endpoint)
 
     @property
     def registered(self) -> bool:
@@ -154,6 +153,7 @@ class SimulatedSlave:
                     self.endpoint.publish_statuses(command.statuses, complete=command.complete)
                 elif isinstance(command, commands.Launch):
                     self._run(command.assignments)
+        self._services.acknowledge_starts()
         self.endpoint.ask(now)
 
     def _run(self, assignments: Sequence[Assignment]) -> None:

@@ -82,6 +82,23 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
     return request
 
 
+def start_to_msg(order: StartInstance, journal: int) -> srv.ControlHost.Request:
+    """Return the order of a START with the watermark of the journal that has the assignment."""
+    request = order_to_msg(order)
+    request.arguments = json.dumps({"journal": journal})
+    return request
+
+
+def journal_of(request: srv.ControlHost.Request) -> int:
+    """Return the watermark in a START; 0: it has none; raise `Refused` for an invalid one."""
+    if not request.arguments:
+        return 0
+    journal = convert.json_object(request.arguments, "the arguments of a start").get("journal", 0)
+    if type(journal) is not int or journal < 0:
+        raise Refused(f"the journal of a start is {journal!r:.100}; allowed: a whole number from 0")
+    return journal
+
+
 def order_from_msg(request: srv.ControlHost.Request) -> Order:
     """Return the inverse of `order_to_msg`; raise `Refused` for an invalid request."""
     instance = convert.instance_from_msg(request.instance)

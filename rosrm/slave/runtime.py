@@ -254,7 +254,9 @@ class SlaveRuntime:
             self._take, self._amend, self._set_lifecycle, self._replication.keep,
             self._drop_snapshots, self._execute, self._read_log, self._measure_links, self._reload,
         )  # fmt: skip
-        SlaveServices(self._endpoints, duties, config.host, max_age, lambda: self._endpoint.epoch)
+        self._services = SlaveServices(
+            self._endpoints, duties, config.host, max_age, self._endpoint
+        )
 
     @property
     def _snapshots(self) -> Path:
@@ -375,6 +377,7 @@ class SlaveRuntime:
             self._participant.spin(max(0.0, wake - time.monotonic()))
             now = time.monotonic()
             self._work(now)
+            guard.call(self._services.acknowledge_starts)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
 

@@ -20,7 +20,7 @@ from rosrm.model.codec import to_plain
 from rosrm.ros import convert
 from rosrm.ros.master import services
 from rosrm.ros.master.known_specs import KnownSpecs
-from rosrm.ros.orders import order_from_msg
+from rosrm.ros.orders import journal_of, order_from_msg
 from rosrm_msgs import msg, srv
 from tests.fuzz.hostile import floats, fuzzed, json_values, texts
 
@@ -85,6 +85,7 @@ READERS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
     "snapshot": (msg.SnapshotReport, convert.snapshot_from_msg),
     "restart": (msg.RestartPolicy, convert.restart_from_msg),
     "order": (srv.ControlHost.Request, order_from_msg),
+    "journal": (srv.ControlHost.Request, journal_of),
     "submit": (srv.Submit.Request, lambda one: MASTER._submitted(one, 1, SENDER)),
     "apply": (srv.Apply.Request, lambda one: MASTER._applied(one, 1, SENDER)),
     "modes": (srv.LoadModes.Request, lambda one: MASTER._modes_loaded(one, 1, SENDER)),

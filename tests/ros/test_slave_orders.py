@@ -8,8 +8,10 @@ import time
 
 import pytest
 
-from rosrm.model.values import InstanceId, RestartPolicy
+from rosrm.model.orders import StartInstance
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
 from rosrm.ros import convert, names
+from rosrm.ros.orders import start_to_msg
 from rosrm.ros.participant import Participant
 from rosrm_msgs import srv
 from tests.ros.clusters import NODE, host, node, service
@@ -18,6 +20,8 @@ from tests.waiting import wait_gone
 
 NEVER = RestartPolicy("never")
 ON_FAILURE = RestartPolicy("on-failure", delay=0.05)
+#: Of the orders; newer than that of the master.
+EPOCH = 1 << 40
 
 
 @pytest.fixture(scope="module")
@@ -33,11 +37,19 @@ class Orders:
 
     def set_restart(self, instance: InstanceId, restart: RestartPolicy):
         """Order another restart policy; return the answer."""
-        request = srv.ControlHost.Request(
-            envelope=self._master.control.envelope(time.monotonic_ns(), 1 << 40),
-            action=srv.ControlHost.Request.AMEND,
-            instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
+        return self._ask(
+            srv.ControlHost.Request(
+                action=srv.ControlHost.Request.AMEND,
+                instance=convert.instance_to_msg(instance), restart=convert.restart_to_msg(restart),
+            )
         )  # fmt: skip
+
+    def start(self, assignment: Assignment):
+        """Order the start of an instance; return the answer."""
+        return self._ask(start_to_msg(StartInstance(assignment), journal=0))
+
+    def _ask(self, request: srv.ControlHost.Request):
+        request.envelope = self._master.control.envelope(time.monotonic_ns(), EPOCH)
         return self._master.ask(srv.ControlHost, path.of_host("h0", names.CONTROL), request).answer
 
 
@@ -88,6 +100,14 @@ def test_a_policy_for_an_unknown_instance_is_refused(orders) -> None:
     answer = orders.set_restart(InstanceId("nobody", 99), NEVER)
     assert (answer.accepted, answer.code) == (False, "unknown")
     assert "nobody#99 is not known here" in answer.message
+
+
+def test_an_order_to_start_is_acknowledged(orders) -> None:
+    """The slave answers after the launch, and a repetition that launches nothing, too."""
+    spec = ProcessSpec("ordered", command=("true",))
+    for _ in range(2):
+        answer = orders.start(Assignment(InstanceId("ordered", 99), spec, EPOCH, "ordered"))
+        assert answer.accepted, answer.message
 
 
 def test_readiness_over_kills_of_the_slave(cluster, tmp_path) -> None:

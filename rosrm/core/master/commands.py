@@ -24,7 +24,7 @@ RefusalCode = Literal["denied", "invalid", "journal", "name_taken", "quota", "un
 
 @dataclass(frozen=True, slots=True)
 class Assign:
-    """Hand an assignment to a host with the answer to its open request."""
+    """Send an assignment to a host that has requested work."""
 
     host_id: int
     assignment: Assignment
@@ -59,7 +59,7 @@ class Withdraw:
 
 @dataclass(frozen=True, slots=True)
 class Redeliver:
-    """Order the start of a fetched assignment, because the answer that carried it may be lost.
+    """Order the start of a fetched assignment, because the message that carried it may be lost.
 
     An assignment that the slave has not fetched stays open: it can be withdrawn without an order.
     """

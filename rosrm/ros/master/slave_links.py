@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -24,7 +24,7 @@ from rosrm.model.values import Assignment, HostDescription
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlClient, accepted, version_refusal
 from rosrm.ros.master.reading_stats import ReadingStats
-from rosrm.ros.orders import order_to_msg
+from rosrm.ros.orders import order_to_msg, start_to_msg
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
 from rosrm.ros.sealed_readings import RegisteredSlave, reading_channel
 from rosrm_msgs import srv
@@ -65,8 +65,8 @@ class HostLink:
         searched_from: monotonic seconds of that registration or silence.
         deferred: orders and requests of it that wait for its first beat.
         introductions: introductions to it that wait for its first beat.
-        outbox: assignments for the answer to its open request.
-        poll: answers that request; None: none is open.
+        outbox: assignments that wait for its request for work.
+        poll: answers its open request; None: none is open.
         forget_poll: removes the open request from those that the master may still refuse.
     """
 
@@ -272,7 +272,7 @@ class HostLinks:
     # --- work ----------------------------------------------------------------------------
 
     def assign(self, command: Assign) -> None:
-        """Keep an assignment for the answer to the host's request."""
+        """Keep an assignment for `flush`."""
         assignment = stamped_assignment(
             command.assignment, decided=self.decided_at, journalled=time.time_ns()
         )
@@ -289,22 +289,41 @@ class HostLinks:
             self._with_work.add(link.host_id)
 
     def flush(self, journal: int) -> None:
-        """Answer the open requests of hosts that have assignments, with the journal's watermark."""
+        """Send the assignments of hosts with an open request, with the journal's watermark.
+
+        A single one is an order, because the answer to a request reaches the readers of all slaves.
+        Several are one answer, because an order has one assignment, and a burst of orders can
+        overflow the slave's socket.
+        """
         while self._with_work:
             link = self._links[self._with_work.pop()]
             if not link.outbox or link.poll is None:
                 continue
-            respond = link.poll
-            link.close_poll()
-            batch, link.outbox = link.outbox, []
-            respond(
-                srv.RequestProcess.Response(
-                    answer=accepted(epoch=self._epoch),
-                    journal=journal,
-                    slave_beat=int(self.reading_stats.beat[link.host_id]),
-                    assignments=[convert.assignment_to_msg(self._as_sent(one)) for one in batch],
-                )
+            batch, link.outbox = [self._as_sent(one) for one in link.outbox], []
+            if len(batch) == 1 and self._is_discovered(link):
+                self._start(link, batch[0], journal)
+            else:
+                self._answer_poll(link, link.poll, batch, journal)
+
+    def _start(self, link: HostLink, assignment: Assignment, journal: int) -> None:
+        """Order the start of an assignment; the request for work stays open."""
+        request = start_to_msg(StartInstance(assignment), journal)
+        deadline = time.monotonic() + self._order_timeout
+        # The core needs no answer: the slave reports the instance, or the core redelivers it.
+        self._send(link, request, deadline, lambda _: None)
+
+    def _answer_poll(
+        self, link: HostLink, respond: Callable[[Any], None], batch: Sequence[Assignment],
+        journal: int,
+    ) -> None:  # fmt: skip
+        link.close_poll()
+        respond(
+            srv.RequestProcess.Response(
+                answer=accepted(epoch=self._epoch), journal=journal,
+                slave_beat=int(self.reading_stats.beat[link.host_id]),
+                assignments=[convert.assignment_to_msg(one) for one in batch],
             )
+        )  # fmt: skip
 
     def _as_sent(self, assignment: Assignment) -> Assignment:
         return stamped_assignment(self._keyed(assignment), assignment_sent=time.time_ns())
@@ -356,11 +375,17 @@ class HostLinks:
             if not self._is_discovered(link):
                 self._wait(link, _Deferred(deadline, send, done))
                 return
-            beat = int(self.reading_stats.beat[link.host_id])
-            request.envelope = self._client.envelope(beat, self._epoch)
-            self._client.call(link.control, request, deadline, done)
+            self._send(link, request, deadline, done)
 
         self.after_first_reading(link, send, deadline, done)
+
+    def _send(
+        self, link: HostLink, request: srv.ControlHost.Request, deadline: float,
+        done: Callable[[srv.ControlHost.Response | None], None],
+    ) -> None:  # fmt: skip
+        beat = int(self.reading_stats.beat[link.host_id])
+        request.envelope = self._client.envelope(beat, self._epoch)
+        self._client.call(link.control, request, deadline, done)
 
     def _is_discovered(self, link: HostLink) -> bool:
         """Return True if an order need not wait until DDS discovers the slave's service."""

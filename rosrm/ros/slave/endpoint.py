@@ -423,7 +423,7 @@ class SlaveEndpoint:
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return
-        self._seen.note(Watermark(response.journal, self._incarnation, self.cluster))
+        self.note_journal(response.journal, answer.epoch)
         try:
             work = tuple(
                 stamped_assignment(convert.assignment_from_msg(one), slave_received=received)
@@ -434,6 +434,14 @@ class SlaveEndpoint:
             return
         given_at = response.slave_beat / 1e9 if response.slave_beat else None
         self._take(events.AssignmentsReceived(work, given_at))
+
+    def note_journal(self, journal: int, epoch: int) -> None:
+        """Store the watermark of the journal that came with an assignment.
+
+        An assignment of a former run of the master has another epoch.
+        """
+        if journal and epoch == self.epoch:
+            self._seen.note(Watermark(journal, self._incarnation, self.cluster))
 
     # --- reports ---------------------------------------------------------------------------
 

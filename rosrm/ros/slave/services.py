@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -20,13 +21,16 @@ from rosrm.model.orders import (
     ReplicateSnapshot,
     RunExecutor,
     SetLifecycleState,
+    StartInstance,
 )
 from rosrm.model.rows import LogPart
-from rosrm.model.values import InstanceId
+from rosrm.model.traced_values import stamped_assignment
+from rosrm.model.values import Assignment, InstanceId
 from rosrm.ros import names
 from rosrm.ros.control import ControlServer, accepted, refused, version_refusal
-from rosrm.ros.orders import order_from_msg
+from rosrm.ros.orders import journal_of, order_from_msg
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest
+from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm_msgs import srv
 
 
@@ -100,16 +104,18 @@ class SlaveServices:
 
     Args:
         max_age: seconds after which an order is stale.
-        epoch: newest known epoch of the master; older orders are refused.
+        endpoint: knows the newest epoch of the master; older orders are refused.
     """
 
     def __init__(
         self, endpoints: SealedEndpoints[Member], duties: Duties, host: str, max_age: float,
-        epoch: Callable[[], int],
+        endpoint: SlaveEndpoint,
     ) -> None:  # fmt: skip
         self._duties = duties
+        self._endpoint = endpoint
+        self._started: list[Callable[[Any], None]] = []
         path = names.Names(endpoints.participant.settings.namespace)
-        server = ControlServer(endpoints, max_age, epoch)
+        server = ControlServer(endpoints, max_age, lambda: endpoint.epoch)
         server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
         endpoints.serve(srv.ReadLog, path.of_host(host, names.READ_LOG), self._take_log)
 
@@ -121,6 +127,10 @@ class SlaveServices:
         try:
             order = order_from_msg(request)
             match order:
+                case StartInstance(assignment):
+                    self._start(assignment, request)
+                    self._started.append(respond)
+                    return
                 case RunExecutor():
                     self._execute(order, respond)
                     return
@@ -141,11 +151,23 @@ class SlaveServices:
                 case DropReplica(instance):
                     self._duties.drop_snapshots(instance)
                 case _:
-                    self._duties.take(event_of(order, request.envelope.receiver_beat / 1e9))
+                    self._duties.take(event_of(order))
         except Refused as refusal:
             respond(srv.ControlHost.Response(answer=refused(refusal.code, str(refusal))))
             return
         respond(srv.ControlHost.Response(answer=accepted()))
+
+    def acknowledge_starts(self) -> None:
+        """Answer the orders to start; called after the launches, which would wait for this."""
+        started, self._started = self._started, []
+        for respond in started:
+            respond(srv.ControlHost.Response(answer=accepted()))
+
+    def _start(self, assignment: Assignment, request: srv.ControlHost.Request) -> None:
+        self._endpoint.note_journal(journal_of(request), request.envelope.epoch)
+        assignment = stamped_assignment(assignment, slave_received=time.time_ns())
+        given_at = request.envelope.receiver_beat / 1e9
+        self._duties.take(event_of(StartInstance(assignment), given_at))
 
     def _measure_links(self, order: MeasureLinks, respond: Callable[[Any], None]) -> None:
         def done(report: LinkReport) -> None:

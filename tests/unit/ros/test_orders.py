@@ -35,7 +35,7 @@ from rosrm.model.values import (
     ProcessSpec,
     RestartPolicy,
 )
-from rosrm.ros.orders import order_from_msg, order_to_msg
+from rosrm.ros.orders import journal_of, order_from_msg, order_to_msg, start_to_msg
 from rosrm_msgs import srv
 
 ONE = InstanceId("p", 7)
@@ -83,6 +83,20 @@ def test_an_order_with_a_time_that_never_ends_is_refused(order, seconds):
 @pytest.mark.parametrize(("order", "event"), EVENTS, ids=lambda one: type(one).__name__)
 def test_an_order_for_the_core_becomes_its_event(order, event):
     assert event_of(order, 5.0) == event
+
+
+def test_a_start_has_the_watermark_of_the_journal():
+    """Without one, in an order from another source than an assignment, it is 0."""
+    start = StartInstance(ASSIGNMENT)
+    request = start_to_msg(start, 41)
+    assert (journal_of(request), order_from_msg(request)) == (41, start)
+    assert journal_of(order_to_msg(start)) == 0
+
+
+@pytest.mark.parametrize("arguments", ['{"journal": -1}', '{"journal": true}', "[41]", "{"])
+def test_an_invalid_watermark_is_refused(arguments):
+    with pytest.raises(Refused):
+        journal_of(srv.ControlHost.Request(arguments=arguments))
 
 
 def test_an_unknown_action_is_refused():

@@ -264,7 +264,7 @@ def _undo_departure(state: MasterState, host: Host, now: float) -> None:
 
 
 def process_requested(state: MasterState, event: happened.ProcessRequested, now: float) -> None:
-    """Note the open request of a host; the answer follows when there is work."""
+    """Note the open request of a host; assignments follow when there is work."""
     host = state.hosts.find(event.host_id, event.incarnation)
     if host is None:
         raise RequestRefused("register first", "unknown")

@@ -17,7 +17,9 @@ from rosrm.model.values import Assignment, HostDescription, InstanceId, ProcessS
 from rosrm.ros.control import accepted
 from rosrm.ros.master.reading_decoder import Runs
 from rosrm.ros.master.slave_links import HostLinks, _order_answered
+from rosrm.ros.orders import journal_of, order_from_msg
 from rosrm_msgs import srv
+from rosrm_msgs.msg import Envelope
 
 HOST, RUN = 1, 500
 SECURITY = MasterSecurity(ClusterSecret(bytes(32)))
@@ -34,7 +36,7 @@ class FakeClient:
 
     def envelope(self, beat, epoch):
         self.beats.append(beat)
-        return SimpleNamespace()
+        return Envelope(epoch=epoch, receiver_beat=beat)
 
     def call(self, control, request, *arguments):
         self.requests.append(request)
@@ -226,6 +228,63 @@ def test_only_the_messages_have_the_key_and_only_for_a_process_with_snapshots(li
         links.order(SendOrder(number, HOST, StartInstance(one)), now=0.0)
     started = [request.order.assignment.state_key for request in links._client.requests]
     assert started == keys
+
+
+@pytest.fixture
+def poll(links) -> list:
+    """Open a request for work of the slave; return the answers to it."""
+    answers: list = []
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
+    links.open_poll(links.find(HOST, RUN, SLAVE), answers.append, lambda: None)
+    return answers
+
+
+def test_a_single_assignment_is_an_order_with_beat_and_journal(links, poll):
+    """The answer to a request would reach the readers of all slaves; the request stays open."""
+    one = assignment("one", 0)
+    for journal in (41, 42):
+        links.assign(Assign(HOST, one))
+        links.flush(journal)
+    assert [journal_of(request) for request in links._client.requests] == [41, 42]
+    assert [order_from_msg(request) for request in links._client.requests] == 2 * [
+        StartInstance(one)
+    ]
+    assert links._client.beats == [100, 100]
+    assert poll == []
+
+
+def test_several_assignments_are_one_answer(links, poll):
+    """A burst of orders would overflow the slave's socket, and lost ones come 2 s later."""
+    for name in ("one", "two"):
+        links.assign(Assign(HOST, assignment(name, 0)))
+    links.flush(41)
+    links.flush(42)
+    (answer,) = poll
+    assert [one.instance.process for one in answer.assignments] == ["one", "two"]
+    assert (answer.journal, answer.slave_beat) == (41, 100)
+    assert links._client.requests == []
+
+
+def test_an_assignment_waits_for_no_discovery(links, poll, control):
+    """An order to a service that DDS has not discovered is lost; the answer is not."""
+    control.ready = False
+    links.assign(Assign(HOST, assignment("one", 0)))
+    links.flush(41)
+    assert [len(answer.assignments) for answer in poll] == [1]
+    assert links._client.requests == []
+
+
+def test_an_assignment_waits_for_a_request_for_work(links):
+    """A slave without an open request may be leaving, or not yet be under its limits."""
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
+    links.assign(Assign(HOST, assignment("one", 0)))
+    links.flush(41)
+    assert links._client.requests == []
+    links.open_poll(links.find(HOST, RUN, SLAVE), lambda _: None, lambda: None)
+    links.flush(42)
+    assert len(links._client.requests) == 1
 
 
 @pytest.mark.parametrize("text", ["null", "[1]", "3", "{"])

@@ -417,6 +417,18 @@ def test_the_journal_position_of_a_former_run_is_sent_back(monkeypatch, tmp_path
     assert JournalWatermark(path).of_former_run("another", 13) == 0
 
 
+def test_an_assignment_has_the_journal_position_of_its_record(slave) -> None:
+    """The next beat may come too late. An order of another run of the master has another epoch."""
+    first = Master(slave, 11, epoch=2)
+    slave.join(first)
+    slave.endpoint.note_journal(41, epoch=2)
+    slave.endpoint.note_journal(99, epoch=1)
+    second = Master(slave, 12, epoch=3, pid=8)
+    slave.pass_time(3.0, second)
+    second.greet()
+    assert slave.newest(srv.RegisterHost).request.journal_seen == 41
+
+
 def test_a_journal_that_cannot_be_remembered_is_remembered_in_memory(tmp_path) -> None:
     """The slave's disk is full, or its file is invalid."""
     path = tmp_path / "journal_seen"
