@@ -40,7 +40,6 @@ from rosrm.extensions.placement import PlacementPlugins
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys.finding import master_security
-from rosrm.keys.security import Member
 from rosrm.master.diagnostics import DiagnosticsFeed
 from rosrm.master.grants_watch import GrantsWatch
 from rosrm.master.journal_stall import JournalStall
@@ -55,8 +54,8 @@ from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.master.artifacts import ArtifactServices
 from rosrm.ros.master.diagnostics import open_diagnostics
 from rosrm.ros.master.endpoint import MasterEndpoint
+from rosrm.ros.master.search import ASK_EVERY, MasterSearch
 from rosrm.ros.master.services import MasterIdentity
-from rosrm.ros.master_connection import find_master
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.runtime.bootstrap import end_start, handle_signals
@@ -104,6 +103,7 @@ class MasterRuntime:
 
     Args:
         config: checked settings.
+        participant: of this master; the caller closes it.
         placement: the configured scoring policies and filters.
         strategies: the configured migration strategies.
         plugins: rows of `rosrm plugins` for the master's own plugins.
@@ -119,6 +119,7 @@ class MasterRuntime:
     def __init__(
         self,
         config: ClusterConfig,
+        participant: Participant,
         placement: PlacementPlugins,
         strategies: dict[str, MigrationStrategy],
         plugins: Sequence[PluginRow],
@@ -128,6 +129,7 @@ class MasterRuntime:
         reload: SettingsReload,
     ) -> None:
         self._config = config
+        self._participant = participant
         self._reload = reload
         self._checkpoint = checkpoint
         self._declared = declared
@@ -154,40 +156,55 @@ class MasterRuntime:
             handle_signals(self._stop, self._reload.hang_up)
             opened.callback(self._reload.close)
             security = master_security(config.security)
-            self._participant = Participant(config.ros, "rosrm_master")
-            opened.callback(self._participant.close)
-            joined = self._now()
-            self._endpoints = SealedEndpoints(self._participant, security)
+            self._endpoints = SealedEndpoints(participant, security)
             self._grants = GrantsWatch(security)
-            last = self._last_run()
-            # During the restore, DDS discovers another master if there is one.
-            self._state = self._restored(placement, strategies, last, joined)
-            self._refuse_second(max(_ANSWER, joined + _DISCOVERY - self._now()))
-            self._behind = self._now() - joined  # no host could report in that time
-            opened.callback(self._end_record)
-            self._begin_run(last, joined)
+            last, begun = self._last_run(), self._now()
+            self._state = self._new_state(placement, strategies, last.epoch + 1)
             self._endpoint = self._new_endpoint()
+            search = MasterSearch(self._endpoints, self._endpoint)
+            self._look(search)
+            # During the restore, the first answers arrive.
+            self._restore(begun)
+            self._refuse_second(search)
+            self._behind = self._now() - begun  # nothing was decided in that time
+            opened.callback(self._end_record)
+            self._begin_run(last, begun)
+            search.end()
             self._diagnostics = self._new_diagnostics()
             self._closing = opened.pop_all()
 
-    def _refuse_second(self, timeout: float) -> None:
-        me = self._config.name
-        security: Member = self._endpoints.security.client()
-        first = find_master(SealedEndpoints(self._participant, security), f"master {me}", timeout)
-        if first is not None:
-            raise Refused(
-                f"a master runs already on {self._config.ros.describe()}: {first.master!r}, pid "
-                f"{first.pid} on {first.hostname}. Stop it first, or give this one another domain",
-                "second_master",
-            )
+    def _look(self, search: MasterSearch) -> None:
+        """Show this master to the slaves, and ask for another one."""
+        now = self._now()
+        self._beat(now)
+        search.ask(now)
 
-    def _restored(
-        self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy],
-        last: _LastRun, now: float,
-    ) -> MasterState:  # fmt: skip
-        """Return the state of the former run; this changes nothing in the journal."""
+    def _refuse_second(self, search: MasterSearch) -> None:
+        """Wait until the search for another master ends; raise `Refused` if there is one."""
+        hosts = self._state.hosts.by_name.keys()
+        ask_at = now = self._now()
+        deadline = max(now + _ANSWER, self._participant.created_at + _DISCOVERY)
+        while not search.has_ended(hosts) and now < deadline:
+            if now >= ask_at:
+                ask_at = now + ASK_EVERY
+                self._look(search)
+            self._participant.spin(max(0.0, min(ask_at, deadline) - now))
+            now = self._now()
+        first = search.found
+        if first is not None:
+            reason = (
+                f"a master runs already on {self._config.ros.describe()}: {first.master!r}, pid "
+                f"{first.pid} on {first.hostname}. Stop it first, or give this one another domain"
+            )
+            search.give_way(reason)
+            raise Refused(reason, "second_master")
+
+    def _new_state(
+        self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy], epoch: int
+    ) -> MasterState:
+        """Return a state without hosts and processes."""
         state = MasterState(
-            self._config.core(), placement, strategies, last.epoch + 1, declared=self._declared
+            self._config.core(), placement, strategies, epoch, declared=self._declared
         )
         state.plugins.limit = self._deadlines
         state.chain_of = self._reload.chain_of
@@ -195,11 +212,14 @@ class MasterRuntime:
         state.wall = time.time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
+        return state
+
+    def _restore(self, now: float) -> None:
+        """Restore the state of the former run; this changes nothing in the journal."""
         try:
-            restore.restore(state, self._journal.intents, now)
+            restore.restore(self._state, self._journal.intents, now)
         except (AttributeError, KeyError, TypeError, ValueError) as fault:
             raise unreadable(self._config.state / "journal.sqlite", fault) from fault
-        return state
 
     def _begin_run(self, last: _LastRun, now: float) -> None:
         """Write the start of this run to the journal, before any decision of it."""
@@ -309,10 +329,7 @@ class MasterRuntime:
                     self._tick(now)
                 if now >= next_beat:
                     next_beat = now + self._config.control.beat_period
-                    self._endpoint.beat(
-                        now - self._started, self._state.hosts.silent_hosts(),
-                        self._journal.last_sequence,
-                    )  # fmt: skip
+                    self._beat(now)
                 self._take_in(now)
                 next_tick = min(next_tick, now + self._until_loss(now))
                 if self._diagnostics is not None:
@@ -320,6 +337,11 @@ class MasterRuntime:
                 self._endpoint.load.note_turn(self._now() - now)
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
+
+    def _beat(self, now: float) -> None:
+        self._endpoint.beat(
+            now - self._started, self._state.hosts.silent_hosts(), self._journal.last_sequence
+        )
 
     def _until_loss(self, now: float) -> float:
         """Return the seconds until a silent host is lost, for a tick at that moment."""

@@ -61,6 +61,7 @@ class Participant:
         pace: frequency of DDS announcements: "eager" or "steady" (docs/decisions/0009).
 
     Attributes:
+        created_at: monotonic seconds.
         guard: calls every callback of ROS.
     """
 
@@ -80,6 +81,7 @@ class Participant:
             # `rclpy.init`, this installs no signal handlers.
             self.context.init(domain_id=settings.domain, initialize_logging=False)
             self.node = self._lean_node(name)
+        self.created_at = time.monotonic()
         use_exact_timers()
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)

@@ -161,6 +161,8 @@ class SealedEndpoints(Generic[SecurityT]):
     Attributes:
         participant: owner of the entities.
         security: keys and peers of this master, slave or client.
+        refuses_other_runs: answer requests for other runs of the receiver as stale; otherwise not
+            at all.
     """
 
     def __init__(
@@ -170,6 +172,7 @@ class SealedEndpoints(Generic[SecurityT]):
         self.participant = participant
         self.security = security
         self.refused = refused
+        self.refuses_other_runs = True
         _load_service()
 
     def _open(
@@ -213,11 +216,14 @@ class SealedEndpoints(Generic[SecurityT]):
             if envelope is None or found is None:
                 return
             peer, plain = found
+            is_for_other_run = not first_contact and envelope.receiver_run != self.security.run
+            if is_for_other_run and not self.refuses_other_runs:
+                return
             genuine = SealedRequest(opened, peer, answers, _sealed_part(envelope))
             refusal = _denial(peer, service)
             if refusal:
                 genuine.answer(failed_response(service_type, refusal, "denied"))
-            elif not first_contact and envelope.receiver_run != self.security.run:
+            elif is_for_other_run:
                 genuine.answer(failed_response(service_type, _OTHER_RUN, "stale"))
             elif peer.ticket is not None and not self.security.accepts(peer.ticket):
                 genuine.answer(failed_response(service_type, _OLD_TICKET, "stale"))

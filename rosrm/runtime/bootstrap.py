@@ -141,10 +141,10 @@ def has_terminal() -> bool:
 def end_start() -> None:
     """Exclude the objects of the start from garbage collection, and enable the collector.
 
-    Those objects stay until the end. With Python's default thresholds a burst of submissions would
-    take a third longer.
+    Those objects stay until the end. One in a hundred of them is garbage, and a search for it would
+    take longer than the registration of all hosts. With Python's default thresholds a burst of
+    submissions would take a third longer.
     """
-    gc.collect()
     gc.freeze()
     gc.set_threshold(*_COLLECT_AT)
     gc.enable()

@@ -40,6 +40,24 @@ def test_a_second_master_is_refused_naming_the_first(cluster) -> None:
     assert cluster.run(job("undisturbed", "true"))[0].state == "finished"
 
 
+def test_a_master_whose_host_has_another_master_is_refused(make_cluster) -> None:
+    """The search for another master ends early only if no host of the journal has one."""
+    cluster = make_cluster(host("h0"))
+    cluster.submit(service("p"))
+    cluster.wait("p", "running")
+    cluster.end(cluster.master, signal.SIGINT)
+    cluster.reconnect()
+    other = replace(cluster.cluster, name="other", ros=cluster.ros, state=cluster.directory / "m2")
+    second = cluster._start("master2", "rosrm.master", other.to_json())
+    cluster.wait_for_hosts()
+    said = refused(cluster, cluster.start_master())
+    assert f"a master runs already on {cluster.ros.describe()}: 'other'" in said
+    assert f"pid {second.process.pid}" in said
+    assert said.count("h0 registered") == 1  # with the first run of this master
+    cluster.master = second
+    assert cluster.run(job("undisturbed", "true"))[0].state == "finished"
+
+
 def test_of_two_masters_at_once_one_stays(make_cluster) -> None:
     """Two masters that start at once cannot see each other; one ends and names the other."""
     cluster = make_cluster(started=False)

@@ -204,7 +204,7 @@ def _follow(
     *, repeated: bool,
 ) -> None:  # fmt: skip
     """Set the phase of a process by the status of its owning instance."""
-    before = process.phase
+    before, former = process.phase, process.phase_before_loss
     phase = _phase_of(process, instance)
     state.set_phase(process, phase, now, status.message)
     if phase is not before:
@@ -220,7 +220,9 @@ def _follow(
             process=process.name, host=instance.host.name,
             facts={"number": instance.id.number, "pid": status.pid, "restarts": status.restarts},
         )  # fmt: skip
-        if phase in (ProcessPhase.RUNNING, ProcessPhase.BACKOFF):
+        # The journal still has the phase before the loss, with its start.
+        is_saved = former is not None and former[0] is phase
+        if phase in (ProcessPhase.RUNNING, ProcessPhase.BACKOFF) and not is_saved:
             state.save(process)
 
 

@@ -69,11 +69,6 @@ class RivalWatch:
             self._ask(beat, now)
 
     def _ask(self, beat: msg.MasterBeat, now: float) -> None:
-        request = srv.Handshake.Request(
-            protocol_version=PROTOCOL_VERSION, software_version=__version__, role="master",
-            name=self._identity.as_client,
-        )  # fmt: skip
-
         def answered(answer: srv.Handshake.Response | None) -> None:
             if answer is None or master_identity(answer) != master_identity(beat):
                 return
@@ -81,6 +76,14 @@ class RivalWatch:
             is_same = newest is not None and newest.incarnation == beat.incarnation
             self.found = newest if is_same else beat
 
+        self.ask(now, answered)
+
+    def ask(self, now: float, answered: Callable[[srv.Handshake.Response | None], None]) -> None:
+        """Send a handshake to all other masters; `answered` gets an answer, or None in the end."""
+        request = srv.Handshake.Request(
+            protocol_version=PROTOCOL_VERSION, software_version=__version__, role="master",
+            name=self._identity.as_client,
+        )  # fmt: skip
         self._control.call(self._made_client(), request, now + _PATIENCE, answered)
 
     def _made_client(self) -> SealedClient:

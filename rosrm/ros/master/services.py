@@ -44,6 +44,8 @@ _Respond = Callable[[Any], None]
 
 #: Most letters of the name of a client or peer in records.
 _LONGEST_PEER: Final = 200
+#: Handshakes of clients and masters that are held; senders repeat theirs.
+_MOST_HELD: Final = 2000
 #: Seconds for which an introduction to a newly registered slave waits for its first reading.
 _FIRST_READING: Final = 1.0
 
@@ -116,6 +118,7 @@ class MasterServices:
         self._known = KnownSpecs()
         self._open: dict[int, Callable[[Reply], None]] = {}
         self._next_request = 1
+        self._held: list[tuple[srv.Handshake.Request, SealedRequest]] | None = None
         self._offer(names.Names(endpoints.participant.settings.namespace))
 
     def _offer(self, path: names.Names) -> None:
@@ -257,6 +260,10 @@ class MasterServices:
     def _take_handshake(self, request: srv.Handshake.Request, open_request: SealedRequest) -> None:
         if request.role == "master" and request.name == self._identity.as_client:
             return
+        if self._held is not None and request.role != "slave":
+            if len(self._held) < _MOST_HELD:
+                self._held.append((request, open_request))
+            return
         who = sanitized(f"{request.role} {request.name}", _LONGEST_PEER)
         fault = version_refusal(request.protocol_version, who)
         if fault:
@@ -269,6 +276,16 @@ class MasterServices:
                 epoch=self._identity.epoch, beat=time.monotonic_ns(),
             )
         )  # fmt: skip
+
+    def hold_greetings(self) -> None:
+        """Leave the handshakes of clients and other masters open until `answer_greetings`."""
+        self._held = []
+
+    def answer_greetings(self) -> None:
+        """Answer the handshakes that were held, and later ones at once."""
+        held, self._held = self._held or [], None
+        for request, open_request in held:
+            self._endpoints.participant.guard.call(self._take_handshake, request, open_request)
 
     def _take_registration(
         self, request: srv.RegisterHost.Request, sealed: SealedRequest, respond: _Respond

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
+from rosrm.core.master.state.intents import process_intent
+from rosrm.model.lazy import mapping_to_json
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
 
@@ -58,6 +62,18 @@ def test_running_processes_keep_running_and_are_not_started_twice() -> None:
     assert (cluster.phase("p"), cluster.phase("q")) == ("running", "running")
     assert {n: m.programs[next(iter(m.programs))].pid for n, m in cluster.machines.items()} == pids
     assert len(cluster.assigned()) == 2
+
+
+def test_a_process_that_runs_as_before_is_not_written_again() -> None:
+    """The journal has its phase with the start of that phase, as the next master would write it."""
+    cluster = Cluster("a").with_processes(process("p"))
+    written = cluster.intents["process"]["p"]
+    cluster.wait(5.0)
+    cluster.restart_master()
+    assert cluster.phase("p") == "running"
+    assert cluster.intents["process"]["p"] is written
+    intent = process_intent(cluster.state, cluster["p"])
+    assert json.loads(mapping_to_json(intent.value)) == written
 
 
 def test_ends_during_the_absence_of_the_master_are_known() -> None:

@@ -43,7 +43,7 @@ class Service:
         self.sent: list[srv.Sealed.Response] = []
         self.refused: list[str] = []
         self.security = security or NoSecurity()
-        endpoints = SealedEndpoints(made, self.security, self.refused.append)
+        self.endpoints = endpoints = SealedEndpoints(made, self.security, self.refused.append)
         endpoints.serve(kind, name, handle, first_contact=security is None)
 
     def create_service(self, _kind, _name, _callback, *, qos_profile):
@@ -82,6 +82,24 @@ def test_a_request_whose_handler_raises_is_answered_as_failed(caplog, kind, name
     assert not answer.accepted
     assert "Refused: a result is a JSON NoneType" in answer.message
     assert len(caplog.messages) == 1
+
+
+@pytest.mark.parametrize("refuses", [True, False])
+def test_a_request_for_another_run_is_left_to_that_run(refuses) -> None:
+    """A starting master does not answer as stale what a running master may accept."""
+    key = ClusterSecret(bytes(32)).key_of(own_grant(Principal("host", "robot-1")))
+    service = Service(
+        srv.ReadLog, "/read_log", lambda *_: pytest.fail("it was handled"), MemberSecurity(key)
+    )
+    service.endpoints.refuses_other_runs = refuses
+    sender = MemberSecurity(key).bearer(*_ticket(key, time.monotonic_ns() + 10**10), bytes(RUN))
+    codes = [response.answer.code for response in service.answers(sender=sender)]
+    assert codes == (["stale"] if refuses else [])
+
+
+def _ticket(key, until: int) -> tuple[str, bytes]:
+    ticket = Ticket(until, 7, "read_log", 0, "p", Principal("user", "ada"))
+    return ticket.text(), ticket.key(key.key)
 
 
 def test_an_error_of_the_receiver_is_answered_without_its_paths(caplog) -> None:

@@ -1,0 +1,43 @@
+"""Assembly of the master from its settings and the configured plugins."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+from rosrm.config.placement import chain_of, placement_of
+from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
+from rosrm.extensions.registry import Registry
+from rosrm.master.fallback_policy import fallback_of
+from rosrm.master.runtime import MasterRuntime
+from rosrm.master.settings_reload import SettingsReload
+from rosrm.ros.participant import Participant
+from rosrm.runtime.bootstrap import Handover
+
+
+def new_runtime(
+    config: ClusterConfig, handover: Handover, participant: Participant
+) -> MasterRuntime:
+    """Create the configured plugins, and return a master with them."""
+    registry = Registry.load(handover.plugins)
+    placement = placement_of(config, registry)
+    strategies = registry.migrations(config.migration.strategies)
+    checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
+    rows = registry.rows("scoring", "filter", "migration", "checkpoint")
+    placement = replace(placement, fallback=fallback_of(registry, config))
+    declared = registry.declared(config.migration.strategies)
+    reload = SettingsReload(config, handover.source, partial(chain_of, registry))
+    return MasterRuntime(
+        config, participant, placement, strategies, rows, checkpoint,
+        declared=declared, reload=reload,
+    )  # fmt: skip
+
+
+def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:
+    """Return the checkpoint policy, or None if it is the default one and not installed.
+
+    A policy that a file names was checked before, but the default may be missing.
+    """
+    policy = config.checkpoint.policy
+    is_default = policy == CheckpointPolicySettings().policy
+    return None if is_default and policy not in registry.names("checkpoint") else policy
