@@ -531,7 +531,7 @@ class SlaveRuntime:
     def _carry_out(self, command: commands.Command) -> None:
         if isinstance(command, commands.Launch):
             if not self._ending.keeps:  # the master expects no new start
-                self._starter.launch(command.assignments)
+                self._starter.launch(command.assignments, command.slots)
         elif isinstance(command, commands.Report):
             self._endpoint.publish_statuses(command.statuses, complete=command.complete)
         elif isinstance(command, commands.Settle):

@@ -82,6 +82,7 @@ class SupervisorClient:
         amends_limits: it can change the limits of a running instance; one of an earlier version
             cannot.
         adopts: it can adopt processes; one of an earlier version cannot.
+        holds: it holds a start until a slot is free; one of an earlier version starts at once.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -102,7 +103,7 @@ class SupervisorClient:
         self.fenced: frozenset[InstanceId] = frozenset()
         self.unenforced: Mapping[str, str] = {}
         self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
-        self.reads_secrets = self.amends_limits = self.adopts = False
+        self.reads_secrets = self.amends_limits = self.adopts = self.holds = False
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -212,7 +213,7 @@ class SupervisorClient:
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,
             fence_rule(order.fence), order.last_contact, order.limits, order.secrets,
-            order.adoption,
+            order.adoption, order.slots,
         )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -304,6 +305,7 @@ class SupervisorClient:
         self.reads_secrets = bool(fields.get("secrets", False))
         self.amends_limits = bool(fields.get("amends", False))
         self.adopts = bool(fields.get("adopts", False))
+        self.holds = bool(fields.get("holds", False))
         groups: Any = fields.get("groups", ())
         self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}

@@ -44,6 +44,7 @@ class LaunchOrder:
         last_contact: of the master with this host, monotonic; 0.0: now.
         secrets: variable to the path of a file, which the supervisor reads at each start.
         adoption: the process that becomes the first run; None: the first run is started.
+        slots: start once fewer other instances than this have not ended; 0: start at once.
     """
 
     instance: InstanceId
@@ -58,6 +59,7 @@ class LaunchOrder:
     limits: LimitRule = field(default_factory=LimitRule)
     secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     adoption: AdoptionRule | None = None
+    slots: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from typing import Any, Final
 from rosrm.core.supervisor.instance import (
     BACKOFF,
     ENDED,
+    HELD,
     RUNNING,
     STARTING,
     STEPS,
@@ -180,7 +181,7 @@ def _int32(value: Any) -> int:
 
 #: Reader of each recorded field; the rules are read beside these.
 _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
-    "phase": _one_of(STARTING, RUNNING, STOPPING, BACKOFF, *sorted(ENDED)),
+    "phase": _one_of(HELD, STARTING, RUNNING, STOPPING, BACKOFF, *sorted(ENDED)),
     "then": _one_of("", THEN_END, THEN_RESTART, THEN_POLICY),
     "pid": lambda value: messages.read_whole(value, 0, 2**31 - 1),
     "exit_code": _int32,
@@ -200,6 +201,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "kill_by": _optional_time,
     "withdrawn": bool,
     "adopted": bool,
+    "slots": lambda value: messages.read_whole(value, 0),
     "peak_memory": messages.read_amount,
     "cpu_time": messages.read_amount,
     "run_time": messages.read_amount,
@@ -207,7 +209,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
 }
 #: Fields that may be missing in older records.
 _NEW_FIELDS: Final = frozenset(
-    {"adopted", "enforced", "fault", "fenced", "heard", "kill_by", "withdrawn"}
+    {"adopted", "enforced", "fault", "fenced", "heard", "kill_by", "slots", "withdrawn"}
 )
 
 

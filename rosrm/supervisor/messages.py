@@ -10,7 +10,7 @@ The client sends orders; the key `do` names the order:
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo, limits,
-                 secrets, adoption
+                 secrets, adoption, slots
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
@@ -22,6 +22,8 @@ The client sends orders; the key `do` names the order:
                                                 content is read at each start and never recorded
                                                 adoption: null, or [pid, birth, boot] of a process
                                                 that runs and becomes the first run
+                                                slots: start once fewer other instances than this
+                                                have not ended; 0: start at once
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -46,7 +48,7 @@ The client sends orders; the key `do` names the order:
 The supervisor sends messages; the key `tell` names the message:
 
     welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets,
-                 amends, adopts
+                 amends, adopts, holds
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
@@ -57,6 +59,7 @@ The supervisor sends messages; the key `tell` names the message:
                                                    secrets: true, for it reads them at each start
                                                    amends: true: it can change limits
                                                    adopts: true: it can adopt processes
+                                                   holds: true: it knows the slots of a start
     status       status                            a change, or the answer to a repeated order; not
                                                    "starting" if the spawn follows at once
     amended      instance, restart, limits,        the amendment is recorded; its status came before
@@ -135,6 +138,7 @@ class Launch(NamedTuple):
     limits: LimitRule = LimitRule()
     secrets: Mapping[str, str] = MappingProxyType({})
     adoption: AdoptionRule | None = None
+    slots: int = 0
 
     def amended(self, amendment: Amend) -> Launch:
         """Return this launch as it is after an amendment."""
@@ -284,6 +288,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         read_limits(fields.get("limits", ())),
         read_texts(fields.get("secrets", {})),
         _adoption(fields.get("adoption")),
+        read_whole(fields.get("slots", 0), 0),  # not sent by clients of an earlier version
     )
 
 
@@ -454,7 +459,7 @@ def encode_welcome(
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
     return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups,
-                 "secrets": True, "amends": True, "adopts": True})  # fmt: skip
+                 "secrets": True, "amends": True, "adopts": True, "holds": True})  # fmt: skip
 
 
 def encode_status(status: Status) -> bytes:

@@ -317,6 +317,7 @@ class Server:
             own_log.write(note)
         for event in takeover.what_happened(recorded, self._state, self._core, self._trees):
             self._happened(event)
+        self._happened(events.TimePassed())  # a killed supervisor may not have started a held one
         self._rewrite_record()
         for instance in self._core.instances.values():
             if instance.pid:
@@ -442,9 +443,10 @@ class Server:
             self._record.launch(launch)
         self._happened(
             events.StartOrdered(
-                launch.instance, launch.restart, launch.stop, launch.fence, launch.heard or None
+                launch.instance, launch.restart, launch.stop, launch.fence,
+                launch.heard or None, launch.slots,
             )
-        )
+        )  # fmt: skip
 
     def _renew(self, order: events.ContactReported) -> None:
         now = time.monotonic()

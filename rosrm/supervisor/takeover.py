@@ -15,7 +15,14 @@ import time
 from collections.abc import Iterator
 
 from rosrm.core.supervisor.events import Event, Exited, Resumed, SessionEnded, Spawned, SpawnFailed
-from rosrm.core.supervisor.instance import RUNNING, STARTING, STOPPING, UNKNOWN_EXIT, Instance
+from rosrm.core.supervisor.instance import (
+    HELD,
+    RUNNING,
+    STARTING,
+    STOPPING,
+    UNKNOWN_EXIT,
+    Instance,
+)
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.supervisor import instance_record, lease_file, procfs
 from rosrm.supervisor.instance_record import Recorded
@@ -61,7 +68,7 @@ def what_happened(
     waiting = [
         instance
         for instance in core.instances.values()
-        if not instance.ended and not trees.birth(instance.key)
+        if not (instance.ended or instance.phase == HELD or trees.birth(instance.key))
     ]
     marked = procfs.find_marked(state) if waiting else {}
     for instance in waiting:

@@ -87,7 +87,7 @@ RULES: dict[str, Any] = {
     "heard": st.none() | SECONDS, "enforced": st.lists(texts, max_size=3).map(tuple), "note": texts,
     "out_of_memory": st.none() | st.tuples(floats, floats),
     "kill": st.booleans(), "transient": st.booleans(), "leftovers": st.booleans(),
-    "adopted": st.booleans(),
+    "adopted": st.booleans(), "slots": NUMBERS,
     "restart": st.builds(RestartRule, WHEN, SECONDS, SECONDS, SECONDS, NUMBERS, SECONDS),
     "stop": st.builds(StopRule, SECONDS, SECONDS),
     "held": st.none() | st.lists(texts, max_size=3).map(tuple),
@@ -118,6 +118,7 @@ def test_hostile_events_leave_a_sound_supervisor(stream):
             messages.encode_status(messages.Status.of(instance))
             line({name: getattr(instance, name) for name in type(instance).__slots__})
             assert instance.ended or instance.phase in (
+                "held",
                 "starting",
                 "running",
                 "backoff",

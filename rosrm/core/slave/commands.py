@@ -18,9 +18,14 @@ from rosrm.model.values import (
 
 @dataclass(frozen=True, slots=True)
 class Launch:
-    """Order the supervisor to start instances."""
+    """Order the supervisor to start instances.
+
+    Attributes:
+        slots: start them once fewer other instances than this have not ended; 0: start at once.
+    """
 
     assignments: tuple[Assignment, ...]
+    slots: int = 0
 
 
 @dataclass(frozen=True, slots=True)

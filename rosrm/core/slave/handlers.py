@@ -13,12 +13,14 @@ from rosrm.core.slave.health import InstanceHealth, watch_of
 from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.core.slave.steps import Step
 from rosrm.core.slave.watches import FIRST_RUN, Awaited, Memo
+from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.devices import title_of
 from rosrm.model.values import (
     Assignment,
     InstanceId,
     InstanceState,
     InstanceStatus,
+    Kind,
     RestartPolicy,
     qualified_name,
 )
@@ -74,7 +76,8 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
         state.waiting[instance] = assignment
         state.hold(instance, _waiting(assignment))
     launches = _start_waiting(state, now)
-    held = [one.instance for one in event.assignments if one.instance in state.waiting]
+    known = [one.instance for one in event.assignments]
+    held = [one for one in known if state.held[one].status.state is InstanceState.HELD]
     why = state.why_wait() if held else ""
     for one in held:
         state.held[one].status = replace(state.held[one].status, message=why)
@@ -86,11 +89,12 @@ def _report_waits(state: SlaveState, now: float) -> _Commands:
     """Report the instances that have waited for a while."""
     waits = []
     for instance, due in list(state.unreported.items()):
-        if instance not in state.waiting:
+        held = state.held.get(instance)
+        if held is None or held.status.state is not InstanceState.HELD:
             del state.unreported[instance]
         elif now >= due:
             del state.unreported[instance]
-            waits.append(state.held[instance].status)
+            waits.append(held.status)
     return [commands.Report(tuple(waits))] if waits else []
 
 
@@ -133,7 +137,36 @@ def _start_waiting(state: SlaveState, now: float) -> _Commands:
     launches = [state.waiting.pop(instance) for instance in started]
     for instance in started:
         state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
-    return [*([commands.Launch(tuple(launches))] if launches else []), *refused]
+    ahead = _handed_ahead(state)
+    return [*([commands.Launch(tuple(launches))] if launches else []), *ahead, *refused]
+
+
+def _handed_ahead(state: SlaveState) -> _Commands:
+    """Hand the next instance to the supervisor, which starts it when a slot becomes free.
+
+    It counts as one that runs, so there is at most one. All others are ready, so nothing that the
+    supervisor does not know yet takes a slot.
+    """
+    following = next(iter(state.waiting.values()), None)
+    if following is None or not (state.holds and state.max_processes and state.slots() == 0):
+        return []
+    ready = all(
+        held.status.state is InstanceState.READY
+        for one, held in state.alive.items()
+        if one not in state.waiting
+    )
+    if not ready or not _is_plain_job(following):
+        return []
+    del state.waiting[following.instance]
+    return [commands.Launch((following,), state.max_processes)]
+
+
+def _is_plain_job(assignment: Assignment) -> bool:
+    """Return True if nothing has to be fetched, awaited or restored to start an instance."""
+    spec = assignment.spec
+    plain = spec.kind is Kind.JOB and not (spec.awaits_graph or spec.artifacts)
+    plain = plain and not spec.container.image and spec.adoption == NO_ADOPTION
+    return plain and not assignment.snapshot_hosts and not assignment.restored
 
 
 def _refuse_late(state: SlaveState, now: float) -> _Commands:
@@ -287,6 +320,7 @@ def _supervisor_replaced(
     state: SlaveState, event: events.SupervisorReplaced, now: float
 ) -> _Commands:
     known = {status.instance for status in event.statuses}
+    state.holds = event.holds
     again: _Commands = []
     for instance, held in list(state.held.items()):
         lost = instance not in known and instance not in state.waiting
@@ -339,6 +373,8 @@ def _follow(
             held.status = replace(held.status, enforced=reported.enforced)
         else:
             held.status = _running(held, reported, now)
+    elif reported.state is held.status.state is InstanceState.HELD:
+        return None  # known since the slave has handed it to the supervisor
     else:
         held.ready_by = held.steering = held.loading = None
         held.status = _with_unready(held, reported)

@@ -7,7 +7,8 @@ Registered              stores the master's epoch, and refuses older ones from t
                         report that no master may have received
 MasterLost              remembers every end until a master has registered this host again
 AssignmentsReceived     launches each instance once, as soon as the bounds on running and starting
-                        instances allow; refuses an instance that was stopped before
+                        instances allow; the supervisor may hold the next job until a slot is
+                        free; refuses an instance that was stopped before
 LaunchRefused           reports that the host cannot run the instance, and why
 StartDelayed            reports why an instance that is starting does not run yet
 StopOrdered             stops the instance; an unknown instance will never be started
@@ -40,6 +41,7 @@ TimePassed              stops an instance that is not ready in time, ends one as
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 from rosrm.core.slave.commands import Command, Launch, Report
 from rosrm.core.slave.events import Event
@@ -71,7 +73,8 @@ def step_all(state: SlaveState, events: Iterable[Event], now: float) -> list[Com
 
 
 def _without_dropped(state: SlaveState, launch: Launch) -> Launch:
-    return Launch(tuple(one for one in launch.assignments if one.instance in state.held))
+    wanted = tuple(one for one in launch.assignments if one.instance in state.held)
+    return replace(launch, assignments=wanted)
 
 
 def _with_devices(state: SlaveState, command: Command) -> Command:

@@ -145,7 +145,8 @@ class SlaveState:
         nodes: those of `alive` with a node in the ROS graph, because the loop of the slave checks
             them in each turn, and most jobs have no node.
         waiting: assignments that start as soon as the bounds allow, in order.
-        unreported: those of `waiting` whose wait is not reported yet, with the time at which it is.
+        unreported: held instances whose wait is not reported yet, with the time at which it is.
+        holds: the supervisor can hold a start until a slot is free.
         tombstones: ended and refused instances, which never start on this host again.
     """
 
@@ -162,6 +163,7 @@ class SlaveState:
     nodes: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     unreported: dict[InstanceId, float] = field(default_factory=dict)
+    holds: bool = False
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
     def hold(self, instance: InstanceId, held: HeldInstance) -> HeldInstance:

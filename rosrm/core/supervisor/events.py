@@ -14,6 +14,7 @@ class StartOrdered(NamedTuple):
         fence: None: no deadline stops the instance, even without contact to the master.
         heard: last contact: newest time known to the client at which the master received a message
             of this host; None: now.
+        slots: start once fewer other instances than this have not ended; 0: start at once.
     """
 
     instance: Key
@@ -21,6 +22,7 @@ class StartOrdered(NamedTuple):
     stop: StopRule
     fence: FenceRule | None = None
     heard: float | None = None
+    slots: int = 0
 
 
 class StopOrdered(NamedTuple):
@@ -82,6 +84,12 @@ class FailOrdered(NamedTuple):
 
 class StatusStored(NamedTuple):
     """The client has stored the final status, so the supervisor may drop it."""
+
+    instance: Key
+
+
+class SlotFreed(NamedTuple):
+    """A held instance may start, because another one has ended."""
 
     instance: Key
 
@@ -169,6 +177,7 @@ Event = (
     | AmendOrdered
     | FailOrdered
     | StatusStored
+    | SlotFreed
     | Resumed
     | Spawned
     | SpawnFailed

@@ -9,9 +9,10 @@ from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.wording import size
 
 Phase = Literal[
-    "starting", "running", "backoff", "stopping",
+    "held", "starting", "running", "backoff", "stopping",
     "exited", "failed", "refused", "fenced", "withdrawn",
 ]  # fmt: skip
+HELD: Final = "held"
 STARTING: Final = "starting"
 RUNNING: Final = "running"
 BACKOFF: Final = "backoff"
@@ -61,14 +62,15 @@ class Instance:
         fenced: text on why it was fenced; "": not fenced, or already being stopped for good.
         kill_by: latest time of SIGKILL after it was fenced; None: not fenced.
         withdrawn: the shutdown of the supervisor stops it, not an order of the client.
+        slots: number of other instances below which a held one starts; 0: it is never held.
         adopted: its last run was started without rosrm, so its exit code is never known.
     """
 
     __slots__ = (
         "adopted", "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault",
         "fence", "fenced", "heard", "key", "kill_by", "kills", "message", "peak_memory",
-        "phase", "pid", "recent", "restart", "restarts", "run_time", "started", "step",
-        "stop", "stop_began", "then", "trail", "withdrawn",
+        "phase", "pid", "recent", "restart", "restarts", "run_time", "slots", "started",
+        "step", "stop", "stop_began", "then", "trail", "withdrawn",
     )  # fmt: skip
 
     def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
@@ -81,6 +83,7 @@ class Instance:
         self.kill_by: float | None = None
         self.withdrawn = False
         self.adopted = False
+        self.slots = 0
         self.phase: Phase = STARTING
         self.then: Then = ""
         self.pid = 0

@@ -2,11 +2,17 @@
 
     phase     event            commands and signals                          next phase
     -         StartOrdered     Spawn                                         starting
+                               its slots are taken by others: -              held
                                its number is dead, or in a shutdown: -       refused
     -         StopOrdered      - (a later order to start is refused)         refused
               FenceOrdered     -                                             refused
               RestartOrdered   -                                             refused
               AmendOrdered     -                                             refused
+    held      SlotFreed        Spawn                                         starting
+              StopOrdered      -                                             exited
+              FencePassed      -                                             fenced
+              FenceOrdered     -                                             fenced
+              AmendOrdered     -                                             held
     starting  Spawned          -                                             running
                                stop ordered in between: SIGINT               stopping
               SpawnFailed      this host cannot start it: -                  refused
@@ -50,6 +56,9 @@ policy and of later orders.
 before ends as withdrawn, not exited. So the master can distinguish this end from an end by its own
 order or by the process.
 
+`SlotFreed` occurs when the end of another instance leaves fewer of them than the `slots` of a held
+one, also without a client: the client has handed it over to start without a further order.
+
 `ClientLost` changes nothing: each instance runs on as long as its fence allows.
 
 An event that is not in the table changes nothing. An order that changes nothing repeats the report
@@ -67,7 +76,16 @@ from typing import Final
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Command, Drop, Leave, ReportStatus, Spawn
-from rosrm.core.supervisor.instance import BACKOFF, MOST_KILLS, REFUSED, THEN_END, Instance, end
+from rosrm.core.supervisor.instance import (
+    BACKOFF,
+    HELD,
+    MOST_KILLS,
+    REFUSED,
+    STARTING,
+    THEN_END,
+    Instance,
+    end,
+)
 from rosrm.core.supervisor.rules import Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS
 
@@ -99,12 +117,14 @@ class SupervisorState:
         self.dead: dict[str, int] = {}
         self.closing = False
         self._timed: dict[Key, float] = {}
+        self._active: dict[Key, Instance] = {}  # neither held nor ended
+        self._held: dict[Key, Instance] = {}
         self._restarted: list[float] = []
 
     def restore(self, instance: Instance) -> None:
         """Restore an instance that an earlier supervisor of this host recorded."""
         self.instances[instance.key] = instance
-        self._watch_deadline(instance)
+        self._note_change(instance)
 
     def deadline(self) -> float | None:
         """Return the time at which `TimePassed` is due; None: no deadline is set."""
@@ -117,7 +137,7 @@ class SupervisorState:
 
     def handle(self, event: events.Event, now: float) -> list[Command]:
         """Handle an event, and return the commands."""
-        commands = list(self._follow(event, now))
+        commands = [*self._follow(event, now), *self._start_held(now)]
         if self.closing and self._nothing_to_wait_for():
             commands.append(Leave())
         return commands
@@ -143,6 +163,12 @@ class SupervisorState:
         elif isinstance(event, _OrderForUnknown):
             yield from self._unknown(event, now)
 
+    def _start_held(self, now: float) -> Iterator[Command]:
+        """Start held instances, in order, while a slot is free for them."""
+        for instance in list(self._held.values()):
+            if len(self._active) < instance.slots:
+                yield from self._apply(instance, events.SlotFreed(instance.key), now)
+
     def _renew(self, at: float, alive: float) -> None:
         """Renew the fences of instances that are not fenced yet."""
         for instance in self.instances.values():
@@ -151,7 +177,7 @@ class SupervisorState:
             newest = max(at, alive) if instance.fence.alive else at
             if instance.heard < newest:
                 instance.heard = newest
-                self._watch_deadline(instance)
+                self._note_change(instance)
 
     def _fence_in_time(self, instance: Instance, now: float) -> list[Command]:
         at = instance.fence_at
@@ -170,7 +196,7 @@ class SupervisorState:
             self._restarted.append(now)
             return True
         instance.deadline = self._restarted[0] + RESTART_SPAN
-        self._watch_deadline(instance)
+        self._note_change(instance)
         return False
 
     def _known(self, instance: Instance, event: events.Event, now: float) -> Iterator[Command]:
@@ -186,7 +212,9 @@ class SupervisorState:
         name, number = event.instance
         if isinstance(event, events.StartOrdered):
             instance = Instance(event.instance, event.restart, event.stop)
-            instance.fence = event.fence
+            instance.fence, instance.slots = event.fence, event.slots
+            if event.slots:
+                instance.phase, instance.message = HELD, "waits for a free slot there"
             slave_counts = event.fence is not None and event.fence.alive
             known = None if slave_counts else event.heard
             instance.heard = now if known is None else min(known, now)
@@ -199,9 +227,9 @@ class SupervisorState:
             end(instance, REFUSED, "it was never started here")
         elif self.closing:
             end(instance, REFUSED, "the supervisor of this host is shutting down")
-        self._watch_deadline(instance)
+        self._note_change(instance)
         yield ReportStatus(instance.key)
-        if not instance.ended:
+        if instance.phase == STARTING:
             yield Spawn(instance.key)
 
     def _apply(self, instance: Instance, event: events.Event, now: float) -> list[Command]:
@@ -209,10 +237,19 @@ class SupervisorState:
         if transition is None:
             return []
         commands = transition(instance, event, now)
-        self._watch_deadline(instance)
+        self._note_change(instance)
         return commands
 
-    def _watch_deadline(self, instance: Instance) -> None:
+    def _note_change(self, instance: Instance) -> None:
+        """Enter an instance in the tables by its phase and its next deadline."""
+        is_held = instance.phase == HELD
+        for table, enters in (
+            (self._held, is_held), (self._active, not (is_held or instance.ended)),
+        ):  # fmt: skip
+            if enters:
+                table[instance.key] = instance
+            else:
+                table.pop(instance.key, None)
         due = [at for at in (instance.deadline, instance.fence_at) if at is not None]
         if due:
             self._timed[instance.key] = min(due)

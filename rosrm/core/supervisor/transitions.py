@@ -14,6 +14,7 @@ from rosrm.core.supervisor.instance import (
     EXITED,
     FAILED,
     FENCED,
+    HELD,
     KILL_AGAIN,
     REFUSED,
     RUNNING,
@@ -41,6 +42,7 @@ _KILL: Final = len(STEPS) - 1
 #: Largest share by which a back-off is shortened, so that instances that crashed together do not
 #: restart together.
 _JITTER: Final = 0.2
+_NEVER_STARTED: Final = "stopped before it was started"
 
 Transition = Callable[[Instance, events.Event, float], list[Command]]
 
@@ -62,7 +64,7 @@ def _spawn_failed(instance: Instance, event: events.Event, now: float) -> list[C
     assert isinstance(event, events.SpawnFailed)
     instance.run_time = instance.cpu_time = instance.peak_memory = 0.0
     if instance.then == THEN_END:
-        _end_as_meant(instance, "stopped before it was started")
+        _end_as_meant(instance, _NEVER_STARTED)
     elif event.transient:
         _by_policy(instance, event.message, succeeded=False, now=now)
     else:  # the program or its directory is missing here: the master tries another host
@@ -168,6 +170,16 @@ def _restart_now(instance: Instance, event: events.Event, now: float) -> list[Co
     return _start_again(instance)
 
 
+def _stop_in_hold(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    _end_as_meant(instance, _NEVER_STARTED)
+    return [ReportStatus(instance.key)]
+
+
+def _fence_in_hold(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    _take_fence(instance, event, now)
+    return _stop_in_hold(instance, event, now)
+
+
 def _stop_in_backoff(instance: Instance, event: events.Event, now: float) -> list[Command]:
     _end_as_meant(instance, f"stopped while it waited for its restart ({ending(instance)})")
     return [ReportStatus(instance.key)]
@@ -221,6 +233,11 @@ def _amend_in_backoff(instance: Instance, event: events.Event, now: float) -> li
 
 
 TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
+    (HELD, events.SlotFreed): _spawn,
+    (HELD, events.StopOrdered): _stop_in_hold,
+    (HELD, events.FencePassed): _fence_in_hold,
+    (HELD, events.FenceOrdered): _fence_in_hold,
+    (HELD, events.AmendOrdered): _amend,
     (STARTING, events.Spawned): _spawned,
     (STARTING, events.SpawnFailed): _spawn_failed,
     (STARTING, events.StopOrdered): _stop_before_spawn,

@@ -70,14 +70,18 @@ class Starter:
     def __post_init__(self) -> None:
         self._environment = {**os.environ, **self.config.ros.environment()}
 
-    def launch(self, assignments: Sequence[Assignment]) -> None:
-        """Start assignments, each as soon as its artifacts and its snapshot are on this host."""
+    def launch(self, assignments: Sequence[Assignment], slots: int = 0) -> None:
+        """Start assignments, each as soon as its artifacts and its snapshot are on this host.
+
+        Args:
+            slots: as in `LaunchOrder`.
+        """
         # A later event of the same batch may have removed an instance, as its supervisor is gone.
         wanted = [one for one in assignments if one.instance in self.state.held]
         for one in wanted:
             if one.spec.artifacts:
                 self.artifacts.prepare(one, self._fetched)
-        ready = self._start_prepared([one for one in wanted if not one.spec.artifacts])
+        ready = self._start_prepared([one for one in wanted if not one.spec.artifacts], slots)
         # Fetching files may take long, and the supervisor reports nothing before the start.
         # Without this report the master would withdraw the assignment.
         waiting = [
@@ -87,11 +91,13 @@ class Starter:
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
 
-    def _start_prepared(self, assignments: Sequence[Assignment]) -> list[Assignment]:
+    def _start_prepared(
+        self, assignments: Sequence[Assignment], slots: int = 0
+    ) -> list[Assignment]:
         """Start those assignments whose snapshots are here, and return them; prepare the others."""
         ready = [one for one in assignments if self.replication.prepare(one, self._prepared)]
         if ready:
-            self._start(ready)
+            self._start(ready, slots)
         return ready
 
     def call_off(self, command: commands.Command) -> bool:
@@ -156,7 +162,7 @@ class Starter:
         _log.info("%s cannot be started here: %s", instance, one_line(reason))
         self.take(events.LaunchRefused(instance, reason))
 
-    def _start(self, assignments: Sequence[Assignment]) -> None:
+    def _start(self, assignments: Sequence[Assignment], slots: int = 0) -> None:
         orders = []
         where = self._location()
         for assignment in assignments:
@@ -172,7 +178,7 @@ class Starter:
                     state_directory=self.supervisor.state, launchers=self.launchers,
                     last_contact=self.state.last_contact,
                 )  # fmt: skip
-                orders.append(replace(order, memo=to_memo(held.memo)))
+                orders.append(replace(order, memo=to_memo(held.memo), slots=slots))
             except LaunchError as error:
                 self._refuse(assignment.instance, str(error))
         if orders:

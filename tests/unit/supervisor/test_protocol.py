@@ -71,6 +71,7 @@ ORDERS = st.one_of(
         LIMITS,
         st.dictionaries(WORDS, WORDS),
         st.none() | ADOPTIONS,
+        st.integers(0, 2**32),
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),

@@ -37,6 +37,7 @@ from rosrm.core.supervisor.instance import (
     EXITED,
     FAILED,
     FENCED,
+    HELD,
     MOST_KILLS,
     REFUSED,
     RUNNING,
@@ -85,9 +86,8 @@ def test_status_is_that_of_the_model():
     assert (*messages.Status._fields, "devices") == tuple(
         field.name for field in dataclasses.fields(values.InstanceStatus)
     )
-    ours = {STARTING, RUNNING, BACKOFF, STOPPING, *ENDED}
-    slaves = {"ready", "held"}  # the slave decides these
-    theirs = {state.value for state in values.InstanceState} - slaves
+    ours = {HELD, STARTING, RUNNING, BACKOFF, STOPPING, *ENDED}
+    theirs = {state.value for state in values.InstanceState} - {"ready"}  # the slave decides this
     assert ours == theirs
     assert {state.value for state in values.InstanceState if state.ended} == ENDED
 
@@ -558,6 +558,8 @@ class Host(RuleBasedStateMachine):
             assert key not in self.final, "started after its end"
             assert key not in self.stopped, "started after the user's stop"
             assert key not in self.dead_by, "started after its fence had passed"
+            if before.get(key, HELD) == HELD and (slots := self.core.instances[key].slots):
+                assert sum(self.takes_slot(i) for i in self.core.instances.values()) <= slots
             self.queue.append(key)
             if isinstance(event, TimePassed) and before[key] == BACKOFF:
                 self.policy_restarts.setdefault(key, []).append(self.now)
@@ -575,6 +577,10 @@ class Host(RuleBasedStateMachine):
             assert key in self.final, "forgotten before its end"
             del self.final[key]
 
+    @staticmethod
+    def takes_slot(instance):
+        return instance.phase != HELD and not instance.ended
+
     def check_status(self, key):
         status = messages.Status.of(self.core.instances[key])
         if key in self.final:
@@ -582,14 +588,17 @@ class Host(RuleBasedStateMachine):
         elif status.state in ENDED:
             self.final[key] = status
 
-    @precondition(lambda self: sum(not i.ended for i in self.core.instances.values()) < 2)
-    @rule(restart=POLICIES, stop=GRACES, fence=FENCES, ago=st.sampled_from([0.0, 0.0, 0.5, 9.0]))
-    def start(self, restart, stop, fence, ago):
+    @precondition(lambda self: sum(not i.ended for i in self.core.instances.values()) < 3)
+    @rule(
+        restart=POLICIES, stop=GRACES, fence=FENCES, ago=st.sampled_from([0.0, 0.0, 0.5, 9.0]),
+        slots=st.sampled_from([0, 0, 1, 2]),
+    )  # fmt: skip
+    def start(self, restart, stop, fence, ago, slots):
         self.newest += 1
         key = ("a", self.newest)
         if fence is not None:
             self.fences[key], self.contact[key] = fence, self.now - (0.0 if fence.alive else ago)
-        self.happens(StartOrdered(key, restart, stop, fence, self.now - ago))
+        self.happens(StartOrdered(key, restart, stop, fence, self.now - ago, slots))
         self.happens(TimePassed())
         self.look_at_fences()
 
@@ -712,7 +721,14 @@ class Host(RuleBasedStateMachine):
     @invariant()
     def what_was_stopped_is_on_its_way_out(self):
         for key in self.stopped & set(self.core.instances):
-            assert self.core.instances[key].phase not in (RUNNING, BACKOFF), key
+            assert self.core.instances[key].phase not in (HELD, RUNNING, BACKOFF), key
+
+    @invariant()
+    def what_is_held_waits_for_a_slot(self):
+        """Check that nothing is held longer than others take its slots."""
+        active = sum(self.takes_slot(instance) for instance in self.core.instances.values())
+        for key, instance in self.core.instances.items():
+            assert instance.phase != HELD or active >= instance.slots, key
 
     @invariant()
     def what_is_fenced_is_killed_in_time(self):
@@ -725,7 +741,7 @@ class Host(RuleBasedStateMachine):
             elif key in self.fences:
                 assert self.core.deadline() <= self.contact[key] + self.fences[key].after, key
         for key in self.dead_by.keys() & self.core.instances.keys():
-            assert self.core.instances[key].phase not in (RUNNING, BACKOFF), key
+            assert self.core.instances[key].phase not in (HELD, RUNNING, BACKOFF), key
 
     @invariant()
     def what_was_fenced_says_so(self):

@@ -1,10 +1,10 @@
 """Prefetch of short jobs: one assignment beyond `max_processes`, held by the slave.
 
 Several messages pass between the end of one job and the start of the next. For a job of 0.1 s that
-delay is long, so a host with `max_processes` may get one assignment more. Its slave starts that job
-without a further order as soon as a slot is free. A host gets it only if the mean run times of
-earlier runs show that all of its running jobs end soon. A prefetched job that waits longer than
-expected returns to its place in the queue.
+delay is long, so a host with `max_processes` may get one assignment more. Its supervisor or slave
+starts that job without a further order as soon as a slot is free. A host gets it only if the mean
+run times of earlier runs show that all of its running jobs end soon. A prefetched job that waits
+longer than expected returns to its place in the queue.
 """
 
 from __future__ import annotations
