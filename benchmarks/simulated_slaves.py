@@ -62,7 +62,7 @@ from rosrm.testing.loopback import settings_on_this_machine
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05
-#: Slaves that do the handshake at a time: each answer reaches all readers of this process.
+#: Slaves that register at a time. DDS at the master compares each new endpoint with all others.
 _AT_ONCE = 20
 #: Seconds between two rounds of cycles. Slaves that are due in that time are served together,
 #: because each poll for messages costs at least 60 us of waiting.
