@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from rosrm.errors import RosrmError
 from rosrm.extensions.contracts import NoOptions
-from rosrm.model.notices import Notice
+
+if TYPE_CHECKING:  # a slave imports this module, but has no notices
+    from rosrm.model.notices import Notice
 
 
 class NoticesRefused(RosrmError):

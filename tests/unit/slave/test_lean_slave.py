@@ -9,7 +9,8 @@ from rosrm.extensions.installed import installed_plugins
 NOT_NEEDED = (
     "numpy", "pydantic", "rich", "typer", "lark", "psutil", "asyncio", "multiprocessing", "sqlite3",
     "urllib.request", "http.client", "email", "ssl", "statistics", "decimal", "argparse",
-    "hashlib", "annotated_types", "typing_extensions", "rosrm_msgs.srv._submit",
+    "hashlib", "annotated_types", "typing_extensions", "rosrm_msgs.srv._submit", "platform",
+    "rosrm.model.notices",
     "rosrm.master", "rosrm.ros.master", "rosrm.core.master.events",
 )  # fmt: skip
 CODE = f"""
