@@ -22,11 +22,14 @@ _TIMEOUT = 10.0
 
 
 def measure(command: tuple[str, ...], environment: dict[str, str]) -> tuple[float, float]:
-    """Run a command once; return the seconds that passed and those of CPU."""
+    """Run a command once; return the seconds that passed and those of CPU.
+
+    The end of a pipe ends the wait at once. Without a pipe, `subprocess.run` polls every 0.05 s.
+    """
     before, began = _cpu(), time.monotonic()
     subprocess.run(
         [sys.executable, "-m", "rosrm.cli", *command], env=environment, stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL, check=True, timeout=_TIMEOUT,
+        stdout=subprocess.PIPE, check=True, timeout=_TIMEOUT,
     )  # fmt: skip
     return time.monotonic() - began, _cpu() - before
 

@@ -111,7 +111,10 @@ def test_a_bound_participant_has_one_transport_with_one_interface(pace, before):
     assert profile.find(".//initialAnnouncements/count", names).text == "60"
     assert profile.find(".//leaseDuration/sec", names).text == str(LEASE)
     assert profile.find(".//initialAcknackDelay/nanosec", names).text == "1000000"
-    assert (profile.find(".//heartbeatPeriod", names) is not None) == (pace == "steady")
+    writer = profile.find("publisher[@is_default_profile]//heartbeatPeriod", names)
+    assert (writer is not None) == (pace == "steady")
+    requests = profile.find("publisher[@profile_name='client']//heartbeatPeriod/nanosec", names)
+    assert requests.text == "100000000"
 
 
 @pytest.fixture
