@@ -497,21 +497,23 @@ def _start_order_fault(message: msg.ProcessSpec) -> str:
     return ""
 
 
+#: Allowed words of each field, by its name in messages to the user.
+_WORDS: Final[Mapping[str, tuple[Callable[[Any], str], tuple[str, ...]]]] = {
+    "kind": (attrgetter("kind"), tuple(kind.value for kind in values.Kind)),
+    "readiness": (attrgetter("readiness.kind"), get_args(values.ReadinessKind)),
+    "host_loss": (attrgetter("host_loss.then"), get_args(values.HostLossAction)),
+    "isolation": (attrgetter("isolation.then"), get_args(values.IsolationAction)),
+    "after.on_restart": (
+        attrgetter("start_order.on_restart"), get_args(values.DependencyRestartAction)
+    ),
+    "group.ends": (attrgetter("group.ends"), get_args(values.GroupEnd)),
+    "lifecycle": (attrgetter("lifecycle.autostart"), get_args(values.Autostart)),
+}  # fmt: skip
+
+
 def _word_fault(message: msg.ProcessSpec) -> str:
-    words = (
-        ("kind", message.kind, tuple(kind.value for kind in values.Kind)),
-        ("readiness", message.readiness.kind, get_args(values.ReadinessKind)),
-        ("host_loss", message.host_loss.then, get_args(values.HostLossAction)),
-        ("isolation", message.isolation.then, get_args(values.IsolationAction)),
-        (
-            "after.on_restart",
-            message.start_order.on_restart,
-            get_args(values.DependencyRestartAction),
-        ),
-        ("group.ends", message.group.ends, get_args(values.GroupEnd)),
-        ("lifecycle", message.lifecycle.autostart, get_args(values.Autostart)),
-    )
-    for name, given, allowed in words:
+    for name, (given_in, allowed) in _WORDS.items():
+        given = given_in(message)
         if given not in allowed:
             return f"{name} {given!r}; allowed: {', '.join(allowed)}"
     return ""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Final
 
@@ -24,9 +25,14 @@ _SIMILAR: Final = 0.7
 
 def search_path(environment: Mapping[str, str], python: str) -> list[Path]:
     """Return the prefixes to search: AMENT_PREFIX_PATH, then the prefix of this Python."""
-    named = [Path(part) for part in environment.get("AMENT_PREFIX_PATH", "").split(":") if part]
+    return list(_prefixes(environment.get("AMENT_PREFIX_PATH", ""), python))
+
+
+@lru_cache(maxsize=16)
+def _prefixes(ament: str, python: str) -> tuple[Path, ...]:
+    named = tuple(Path(part) for part in ament.split(":") if part)
     own = Path(python).absolute().parent.parent  # not resolved: a venv's python is a link
-    return named if own in named else [*named, own]
+    return named if own in named else (*named, own)
 
 
 def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> Path:

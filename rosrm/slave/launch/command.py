@@ -102,7 +102,7 @@ def _adoption(adoption: Adoption, host: str) -> AdoptionRule | None:
 def _check_length(launch: Launch) -> None:
     """Raise `LaunchError` if the supervisor would refuse the order, which is one line for it."""
     parts = (*launch.argv, *launch.environment, *launch.environment.values())
-    if sum(len(part) + 1 for part in parts) < _SHORT:
+    if sum(map(len, parts)) + len(parts) < _SHORT:
         return
     length = len(json_lines.line({"parts": parts}))
     if length > _LONGEST:

@@ -19,6 +19,7 @@ from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
+from rosrm.runtime.ros_wheels import without_bootstrapper
 from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.epoch import EPOCH_NOTE
 from rosrm.slave.launch.command import launch_order
@@ -68,7 +69,8 @@ class Starter:
     _warned_of: set[str] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
-        self._environment = {**os.environ, **self.config.ros.environment()}
+        own = {**os.environ, **self.config.ros.environment()}
+        self._environment = without_bootstrapper(own)
 
     def launch(self, assignments: Sequence[Assignment], slots: int = 0) -> None:
         """Start assignments, each as soon as its artifacts and its snapshot are on this host.
