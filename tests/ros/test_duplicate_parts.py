@@ -50,11 +50,12 @@ def test_a_master_whose_host_has_another_master_is_refused(make_cluster) -> None
     other = replace(cluster.cluster, name="other", ros=cluster.ros, state=cluster.directory / "m2")
     second = cluster._start("master2", "rosrm.master", other.to_json())
     cluster.wait_for_hosts()
-    said = refused(cluster, cluster.start_master())
+    first = cluster.start_master()
+    cluster.master = second
+    said = refused(cluster, first)
     assert f"a master runs already on {cluster.ros.describe()}: 'other'" in said
     assert f"pid {second.process.pid}" in said
     assert said.count("h0 registered") == 1  # with the first run of this master
-    cluster.master = second
     assert cluster.run(job("undisturbed", "true"))[0].state == "finished"
 
 
