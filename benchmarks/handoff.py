@@ -20,7 +20,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -72,6 +72,7 @@ class Outcome:
         ends: "migrated" or "stayed", of each migration.
         gaps: seconds beyond one period, of each change of the publisher.
         lost, repeated, out_of_order: outputs, or inputs without an answer or with several.
+        moves: seconds from each request to the end of its migration.
     """
 
     ends: list[str]
@@ -79,6 +80,7 @@ class Outcome:
     lost: int
     repeated: int
     out_of_order: int
+    moves: list[float] = field(default_factory=list)
 
 
 class Observer:
@@ -222,16 +224,17 @@ def measure(
         if program == "echo":
             stack.enter_context(driver(cluster, rate))
         observer.wait_for(max(3, int(rate * _SETTLE)))
-        ends = []
+        ends, moves = [], []
         for run in range(runs):
+            began = time.monotonic()
             ends.append(move(cluster))
+            moves.append(time.monotonic() - began)
             observer.wait_for(max(3, int(rate * _SETTLE)))
             if (run + 1) % 10 == 0:
                 say(f"{run + 1}/{runs} migrations at {rate:g} Hz")
         outputs = list(observer.outputs)
-    if strategy == "relaunch":
-        return outcome_of_relaunch(ends, outputs, period)
-    return outcome_of_handoff(ends, outputs, period)
+    outcome_of = outcome_of_relaunch if strategy == "relaunch" else outcome_of_handoff
+    return replace(outcome_of(ends, outputs, period), moves=moves)
 
 
 def main() -> None:
@@ -264,6 +267,8 @@ def main() -> None:
             "gap_p50_ms": round(percentile(gaps, 0.5) * 1e3, 3) if gaps else None,
             "gap_p99_ms": round(percentile(gaps, 0.99) * 1e3, 3) if gaps else None,
             "gap_max_ms": round(max(gaps) * 1e3, 3) if gaps else None,
+            "move_p50_s": round(percentile(outcome.moves, 0.5), 2),
+            "move_max_s": round(max(outcome.moves), 2),
             "moved": outcome.ends.count("migrated"), "stayed": outcome.ends.count("stayed"),
             "transports": transports,
         },

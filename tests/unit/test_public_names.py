@@ -41,6 +41,7 @@ OF_CRIU = {
     "rosrm.ros.fast_dds",
     "rosrm.ros.graph_remains",
     "rosrm.ros.names",
+    "rosrm.ros.peer_announcements",
     "rosrm.runtime.disk_space",
     "rosrm.supervisor",
     "rosrm.supervisor.procfs",

@@ -15,6 +15,7 @@ from rclpy.event_handler import EventHandler
 
 from rosrm.ros.fast_dds import announcing
 from rosrm.ros.graph_remains import close_leaked, open_sockets
+from rosrm.ros.peer_announcements import request_announcements
 from rosrm_criu.control.messages import VARIABLE
 from rosrm_criu.node.graph_departure import Departure, await_peers, await_readers, departure_of
 
@@ -121,6 +122,8 @@ class PortableNode(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no ty
         self._portable_sockets = {
             number: one for number, one in open_sockets().items() if before.get(number) != one
         }
+        if controlled:
+            request_announcements(self.context.get_domain_id(), os.environ)
 
     def _portable_entities(self) -> Iterator[Any]:
         for kind in ("publishers", "subscriptions", "timers", "services", "clients", "guards"):

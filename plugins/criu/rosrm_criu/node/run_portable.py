@@ -294,8 +294,8 @@ class _Run:
 
         A neighbour answers a participant's first announcement within 0.1 ms. Fast DDS 2.14 may
         not be ready to receive that answer, and gets the next one only after the neighbour's
-        period of 3 s. But all neighbours greet a new participant, so another attempt takes only
-        0.02 s (docs/decisions/0024).
+        period of 3 s. So the node requests the announcements of all neighbours. If that request
+        is lost as well, the node enters as another participant (docs/decisions/0024).
         """
         entries = 0
         deadline = time.monotonic() + self._patience
