@@ -10,8 +10,8 @@ slave's code. The master publishes its own figures on `master_load`, by its own 
 - `oldest_reading_p99_s`: at each look of the master, the age of the oldest among the newest
   readings of all hosts.
 - `request_process_*_ms`: one job at a time, from the call of `submit` to the assignment at the
-  slave, an order to the slave's own service.
-  `assigned_*_ms`: from the same call to the master's record of the assignment.
+  slave, an order to the slave's own service. `assigned_*_ms`: from the same call to the master's
+  record of the assignment.
 - `request_process_master_cpu_ms`, `request_process_slaves_cpu_ms`: CPU time of the master, and of
   all simulated slaves, for each of these jobs, beyond their CPU time without jobs.
 

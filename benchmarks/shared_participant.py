@@ -29,7 +29,7 @@ class Berth:
         self.counted = shared.participant.counted
 
     def create_client(self, kind: Any, name: str, *, qos_profile: Any) -> Any:
-        """Return a use of a shared client."""
+        """Return one slave's view of the shared client of a service."""
         return self._shared.client(kind, name, qos_profile)
 
     def create_publisher(self, kind: Any, name: str, qos: Any) -> Any:
@@ -152,7 +152,7 @@ class SharedParticipant:
         self._publishers: dict[str, Any] = {}
 
     def client(self, kind: Any, name: str, qos_profile: Any) -> Any:
-        """Return a use of the shared client of a service."""
+        """Return one slave's view of the shared client of a service."""
         if name not in self._clients:
             made = self.participant.node.create_client(kind, name, qos_profile=qos_profile)
             self._clients[name] = SharedClient(made)

@@ -7,7 +7,7 @@ and each instance is reported as running, and then as ended if it is of a job, w
 All slaves of a process share one DDS participant, one node, and the entities that are seldom used:
 the clients of the master's services, the publishers of statuses and usages, and the reader of
 `master_beat`. Each has its own key, its own publisher of readings and its own service for orders,
-which brings it each single assignment.
+which receives single assignments.
 
 The process prints one JSON object when all are registered and accepted. A line on its standard
 input begins a measurement and the next one ends it; then it prints the counts as JSON.
@@ -62,7 +62,8 @@ from rosrm.testing.loopback import settings_on_this_machine
 
 #: Most seconds between two looks at standard input.
 _LOOK = 0.05
-#: Slaves that register at a time. DDS at the master compares each new endpoint with all others.
+#: Slaves that register at a time. More would only wait, because DDS at the master compares each new
+#: endpoint with all others.
 _AT_ONCE = 20
 #: Seconds between two rounds of cycles. Slaves that are due in that time are served together,
 #: because each poll for messages costs at least 60 us of waiting.

@@ -3,7 +3,7 @@
 The page "Keys" of the reference documents the format.
 
 roles.py        principals, their roles, and the requests that each role may send
-hashing.py      keyed digests, by libsodium
+hashing.py      BLAKE2b digests, with or without a key
 derivation.py   derivation of all keys from the cluster's secret
 sealing.py      encryption and authentication of the messages of one channel
 links.py        both ends of the messages under one key

@@ -162,7 +162,7 @@ class MasterRuntime:
             self._state = self._new_state(placement, strategies, last.epoch + 1)
             self._endpoint = self._new_endpoint()
             search = MasterSearch(self._endpoints, self._endpoint)
-            self._look(search)
+            self._search_once(search)
             # During the restore, the first answers arrive.
             self._restore(begun)
             self._refuse_second(search)
@@ -173,8 +173,8 @@ class MasterRuntime:
             self._diagnostics = self._new_diagnostics()
             self._closing = opened.pop_all()
 
-    def _look(self, search: MasterSearch) -> None:
-        """Show this master to the slaves, and ask for another one."""
+    def _search_once(self, search: MasterSearch) -> None:
+        """Send a beat, and ask all other masters for a handshake."""
         now = self._now()
         self._beat(now)
         search.ask(now)
@@ -187,7 +187,7 @@ class MasterRuntime:
         while not search.has_ended(hosts) and now < deadline:
             if now >= ask_at:
                 ask_at = now + ASK_EVERY
-                self._look(search)
+                self._search_once(search)
             self._participant.spin(max(0.0, min(ask_at, deadline) - now))
             now = self._now()
         first = search.found
@@ -196,7 +196,7 @@ class MasterRuntime:
                 f"a master runs already on {self._config.ros.describe()}: {first.master!r}, pid "
                 f"{first.pid} on {first.hostname}. Stop it first, or give this one another domain"
             )
-            search.give_way(reason)
+            search.refuse_registrations(reason)
             raise Refused(reason, "second_master")
 
     def _new_state(

@@ -1,4 +1,4 @@
-"""JSON of a spec. Most of its fields have defaults, or a policy that other specs share."""
+"""JSON of a spec, from cached texts of its default fields and of policies that specs share."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _POLICIES: Final = frozenset(
     and not any(isinstance(getattr(default, own.name), Mapping) for own in fields(default))
 )  # fmt: skip
 _values_of: Final = attrgetter(*_DEFAULTS)
-#: Most bytes of a policy whose text is kept.
+#: Most letters of the JSON of a policy that is cached.
 _MOST_KEPT: Final = 4096
 _policy_text: Final = remembered(
     lambda policy: to_json(to_plain(policy)), lambda text: len(text) <= _MOST_KEPT
@@ -37,7 +37,7 @@ _DEFAULT_TEXTS: Final = tuple(
 
 
 def spec_to_json(spec: ProcessSpec) -> str:
-    """Return the same JSON as `to_json(to_plain(spec))`, in another order of the fields."""
+    """Return the JSON of a spec: `to_json(to_plain(spec))` but for the order of the fields."""
     texts, others = [], ["name"]
     values = zip(_DEFAULTS.items(), _DEFAULT_TEXTS, _values_of(spec), strict=True)
     for (name, default), text, item in values:

@@ -3,10 +3,10 @@
 import sys
 from typing import Any
 
-from rosrm.ros.types_on_use import import_types_on_use
+from rosrm.ros.lazy_types import import_types_lazily
 
 _modules: dict[str, Any] = sys.modules
 # Generated messages import the code generator, which they do not use: 60 ms of every command. None
 # makes this import fail, and the generator's package tolerates that.
 _modules.setdefault("rosidl_generator_py.generate_py_impl", None)
-import_types_on_use()
+import_types_lazily()

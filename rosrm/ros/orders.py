@@ -90,7 +90,7 @@ def start_to_msg(order: StartInstance, journal: int) -> srv.ControlHost.Request:
 
 
 def journal_of(request: srv.ControlHost.Request) -> int:
-    """Return the watermark in a START; 0: it has none; raise `Refused` for an invalid one."""
+    """Return the journal watermark of a START, 0 without one; raise `Refused` if it is invalid."""
     if not request.arguments:
         return 0
     journal = convert.json_object(request.arguments, "the arguments of a start").get("journal", 0)

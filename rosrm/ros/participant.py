@@ -61,7 +61,7 @@ class Participant:
         pace: frequency of DDS announcements: "eager" or "steady" (docs/decisions/0009).
 
     Attributes:
-        created_at: monotonic seconds.
+        created_at: monotonic time of the join, in seconds.
         guard: calls every callback of ROS.
     """
 

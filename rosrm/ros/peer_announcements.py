@@ -1,10 +1,10 @@
-"""Announcements of all peers on request, because a new participant misses most of their replies.
+"""Request for the announcements of all peers, because a new participant misses most replies.
 
 Each peer replies once to the first announcement of a new participant. Fast DDS 2.14 sends that
-announcement before the participant can receive: the replies of the next 0.1 to 1 ms are lost, and
-by default a peer announces itself only every 3 s. So this module announces another participant,
-without endpoints, whose address is that of the real one, which then receives the replies
-(docs/decisions/0009).
+announcement before the participant can receive. So the replies of the first 0.1 to 1 ms are lost,
+and by default a peer announces itself again only after up to 3 s. Therefore this module announces a
+second participant, which has no endpoints and has the address of the real one. Each peer replies to
+that address, and the real participant receives the reply (docs/decisions/0009).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _GROUP: Final = "239.255.0.1"
 _FIRST_PORT: Final = 7400
 _PORTS_OF_A_DOMAIN: Final = 250
 _FIRST_UNICAST: Final = 10
-#: With LOCALHOST, rmw_fastrtps announces a participant to the ports of so many on this machine.
+#: With LOCALHOST, rmw_fastrtps sends announcements to the ports of the first 32 participants.
 _MOST_ON_THIS_MACHINE: Final = 32
 _LOOPBACK: Final = "127.0.0.1"
 #: From linux/sockios.h: the IPv4 address of an interface.
@@ -48,14 +48,14 @@ _UDP_V4: Final = 1
 def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
     """Make all peers send their announcements to the participants of this process.
 
-    Nothing is sent where none of its sockets has a default port, for example without UDP.
+    Nothing is sent if no socket of this process has a default port, for example without UDP.
 
     Args:
         domain: ROS domain of the participants.
         environment: of this process.
     """
     if environment.get("ROS_DISCOVERY_SERVER"):
-        return  # the server sends its clients what they need
+        return  # the discovery server sends its clients what they need
     first = _FIRST_PORT + _PORTS_OF_A_DOMAIN * domain
     bound = set(_bound_ports())
     ports = [
@@ -88,13 +88,14 @@ def announcement(address: str, ports: Sequence[int]) -> bytes:
     prefix = _UNKNOWN_VENDOR + os.urandom(10)
     locators = (struct.pack("<iI12x", _UDP_V4, port) + socket.inet_aton(address) for port in ports)
     payload = _PARAMETER_LIST + b"".join((
-        _parameter(0x15, _VERSION + bytes(2)),
-        _parameter(0x16, _UNKNOWN_VENDOR + bytes(2)),
-        _parameter(0x50, prefix + _PARTICIPANT),
-        _parameter(0x58, struct.pack("<I", _ENDPOINTS)),
-        _parameter(0x02, struct.pack("<iI", _LEASE, 0)),
+        _parameter(0x15, _VERSION + bytes(2)),  # PID_PROTOCOL_VERSION
+        _parameter(0x16, _UNKNOWN_VENDOR + bytes(2)),  # PID_VENDORID
+        _parameter(0x50, prefix + _PARTICIPANT),  # PID_PARTICIPANT_GUID
+        _parameter(0x58, struct.pack("<I", _ENDPOINTS)),  # PID_BUILTIN_ENDPOINT_SET
+        _parameter(0x02, struct.pack("<iI", _LEASE, 0)),  # PID_PARTICIPANT_LEASE_DURATION
+        # PID_METATRAFFIC_UNICAST_LOCATOR
         *(_parameter(0x32, locator) for locator in locators),
-        _parameter(0x01, b""),
+        _parameter(0x01, b""),  # PID_SENTINEL
     ))  # fmt: skip
     # Flags, offset of the inline QoS, reader, writer, sequence number 1.
     data = struct.pack("<HH4s4siI", 0, 16, _ANY_READER, _ANNOUNCER, 0, 1) + payload
@@ -107,7 +108,7 @@ def _parameter(number: int, value: bytes) -> bytes:
 
 
 def _bound_ports() -> Iterator[int]:
-    """Return the ports of this process's UDP sockets."""
+    """Yield the ports of this process's UDP sockets."""
     for number in open_sockets():
         try:
             copy = os.dup(number)
@@ -119,7 +120,7 @@ def _bound_ports() -> Iterator[int]:
 
 
 def _own_addresses(any_socket: socket.socket) -> list[str]:
-    """Return the IPv4 address of each interface; that of loopback only if there is no other."""
+    """Return the IPv4 address of each interface; the loopback address only if there is no other."""
     found = []
     for _, name in socket.if_nameindex():
         request = struct.pack("16s24x", name.encode())

@@ -161,8 +161,8 @@ class SealedEndpoints(Generic[SecurityT]):
     Attributes:
         participant: owner of the entities.
         security: keys and peers of this master, slave or client.
-        refuses_other_runs: answer requests for other runs of the receiver as stale; otherwise not
-            at all.
+        refuses_other_runs: if True, answer requests for other runs of the receiver with `stale`; if
+            False, do not answer them.
     """
 
     def __init__(

@@ -141,9 +141,9 @@ def has_terminal() -> bool:
 def end_start() -> None:
     """Exclude the objects of the start from garbage collection, and enable the collector.
 
-    Those objects stay until the end. One in a hundred of them is garbage, and a search for it would
-    take longer than the registration of all hosts. With Python's default thresholds a burst of
-    submissions would take a third longer.
+    Those objects exist until the process ends. The start does not collect garbage before, because
+    only 1 % of them are garbage, and the collection would take longer than the registration of all
+    hosts. With Python's default thresholds a burst of submissions would take a third longer.
     """
     gc.freeze()
     gc.set_threshold(*_COLLECT_AT)
@@ -155,7 +155,9 @@ class LogFormatter(logging.Formatter):
 
     _second, _time = -1, ""
 
-    def formatTime(self, record: logging.LogRecord, datefmt: str | None = None) -> str:  # noqa: N802 - logging's name
+    def formatTime(  # noqa: N802
+        self, record: logging.LogRecord, datefmt: str | None = None
+    ) -> str:
         """Return the time, formatted once a second, because a burst of jobs logs many lines."""
         second = int(record.created)
         if second != self._second:

@@ -236,7 +236,10 @@ class SupervisorLink:
         found = {one: from_memo(memo) for one, memo in client.memos.items()}
         memos = {one: memo for one, memo in found.items() if memo is not None}
         statuses = [*client.instances, *self._launch_again(client)]
-        self._take(events.SupervisorReplaced(tuple(statuses), memos, client.fenced, client.holds))
+        replaced = events.SupervisorReplaced(
+            tuple(statuses), memos, client.fenced, client.holds_starts
+        )
+        self._take(replaced)
         return len(client.instances)
 
     def _launch_again(self, client: SupervisorClient) -> list[InstanceStatus]:

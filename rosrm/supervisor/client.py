@@ -82,7 +82,8 @@ class SupervisorClient:
         amends_limits: it can change the limits of a running instance; one of an earlier version
             cannot.
         adopts: it can adopt processes; one of an earlier version cannot.
-        holds: it holds a start until a slot is free; one of an earlier version starts at once.
+        holds_starts: it holds a start until a slot is free; one of an earlier version starts at
+            once.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -103,7 +104,7 @@ class SupervisorClient:
         self.fenced: frozenset[InstanceId] = frozenset()
         self.unenforced: Mapping[str, str] = {}
         self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
-        self.reads_secrets = self.amends_limits = self.adopts = self.holds = False
+        self.reads_secrets = self.amends_limits = self.adopts = self.holds_starts = False
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -305,7 +306,7 @@ class SupervisorClient:
         self.reads_secrets = bool(fields.get("secrets", False))
         self.amends_limits = bool(fields.get("amends", False))
         self.adopts = bool(fields.get("adopts", False))
-        self.holds = bool(fields.get("holds", False))
+        self.holds_starts = bool(fields.get("holds", False))
         groups: Any = fields.get("groups", ())
         self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}

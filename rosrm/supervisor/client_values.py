@@ -44,7 +44,8 @@ class LaunchOrder:
         last_contact: of the master with this host, monotonic; 0.0: now.
         secrets: variable to the path of a file, which the supervisor reads at each start.
         adoption: the process that becomes the first run; None: the first run is started.
-        slots: start once fewer other instances than this have not ended; 0: start at once.
+        slots: start once fewer than this number of other instances are active, that is, neither
+            held nor ended; 0: start at once.
     """
 
     instance: InstanceId

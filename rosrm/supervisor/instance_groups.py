@@ -52,7 +52,7 @@ class InstanceGroups:
         self._unset: dict[Key, dict[str, Any]] = {}  # limits that could not be set at the start
         self._kills_before: dict[Key, int] = {}
         self._emptied: dict[str, float] = {}
-        self._homes: dict[str, int] = {}  # descriptors of the files by which this thread returns
+        self._homes: dict[str, int] = {}  # group to descriptor of its `tasks` file, for the return
         self._unfinished: dict[Key, set[Tree]] = {}  # groups that some processes did not enter
 
     def find_again(self, live: Mapping[Key, int]) -> None:
@@ -190,7 +190,7 @@ class InstanceGroups:
             yield group
 
     def _return(self, home: str) -> None:
-        """Move this thread back; an error must not hide that the instance was started."""
+        """Move this thread back to its own group; only log an error: the instance has started."""
         try:
             if home not in self._homes:
                 tasks = os.path.join(home, "tasks")

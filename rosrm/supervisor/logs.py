@@ -246,7 +246,8 @@ class LogFolder:
         """Remove the logs of the processes started longest ago, once the excess is large enough."""
         processes = len(self._numbers)
         excess = processes - limits.processes
-        # Known ones stay. So without this bound, each start would look at all of them.
+        # Logs of known processes stay. Without the second bound, each start would search them all
+        # again.
         if excess < PROCESSES_AT_ONCE or processes < self._left + PROCESSES_AT_ONCE:
             return
         stay = {paths.safe_name(process) for process, _ in known}

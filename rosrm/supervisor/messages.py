@@ -22,8 +22,8 @@ The client sends orders; the key `do` names the order:
                                                 content is read at each start and never recorded
                                                 adoption: null, or [pid, birth, boot] of a process
                                                 that runs and becomes the first run
-                                                slots: start once fewer other instances than this
-                                                have not ended; 0: start at once
+                                                slots: start once fewer than this number of others
+                                                are neither held nor ended; 0: start at once
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -59,7 +59,7 @@ The supervisor sends messages; the key `tell` names the message:
                                                    secrets: true, for it reads them at each start
                                                    amends: true: it can change limits
                                                    adopts: true: it can adopt processes
-                                                   holds: true: it knows the slots of a start
+                                                   holds: true: it can hold a start (`slots`)
     status       status                            a change, or the answer to a repeated order; not
                                                    "starting" if the spawn follows at once
     amended      instance, restart, limits,        the amendment is recorded; its status came before

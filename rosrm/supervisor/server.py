@@ -183,7 +183,8 @@ class Server:
             self._groups.remove(key, time.monotonic())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
         status = messages.Status.of(instance)
-        # The slave knows that it has ordered a start. Most spawns are in the same round.
+        # The slave has ordered the start, and most spawns are in the same round. So `starting` is
+        # sent only if the round ends without the outcome of the spawn.
         self._first_starts.pop(key, None)
         if instance.phase == STARTING and not instance.started:
             self._first_starts[key] = status
@@ -317,7 +318,8 @@ class Server:
             own_log.write(note)
         for event in takeover.what_happened(recorded, self._state, self._core, self._trees):
             self._happened(event)
-        self._happened(events.TimePassed())  # a killed supervisor may not have started a held one
+        # the former supervisor may not have started a held instance
+        self._happened(events.TimePassed())
         self._rewrite_record()
         for instance in self._core.instances.values():
             if instance.pid:

@@ -102,10 +102,10 @@ def _enter(directory: str) -> None:
         raise SpawnError(message) from None
 
 
-#: Paths of the programs that were found lately, with the times until which they are used again. A
-#: search makes a system call for each directory of the PATH, and jobs often run one program.
+#: Cache of program paths, with the times at which they expire, because a search makes a system call
+#: for each directory of the PATH, and jobs often run the same program.
 _found: Final[dict[tuple[str, str], tuple[str, float]]] = {}
-#: Seconds for which a program is not searched for again, and most of them.
+#: Seconds for which a path is cached; most cached paths.
 _KEPT_FOR: Final = 1.0
 _MOST_KEPT: Final = 100
 
@@ -120,7 +120,7 @@ def find_executable(word: str, environment: Mapping[str, str]) -> str:
     if now < until and os.access(path, os.X_OK):
         return path
     path = _search(word, search)
-    if os.path.isabs(path):  # others depend on the working directory
+    if os.path.isabs(path):  # a relative path depends on the working directory
         if len(_found) >= _MOST_KEPT:
             _found.clear()
         _found[word, search] = path, now + _KEPT_FOR

@@ -41,7 +41,7 @@ def test_a_second_master_is_refused_naming_the_first(cluster) -> None:
 
 
 def test_a_master_whose_host_has_another_master_is_refused(make_cluster) -> None:
-    """The search for another master ends early only if no host of the journal has one."""
+    """The search ends early only if no other master has a host of the journal."""
     cluster = make_cluster(host("h0"))
     cluster.submit(service("p"))
     cluster.wait("p", "running")

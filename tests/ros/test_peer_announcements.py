@@ -1,4 +1,4 @@
-"""Requests for the announcements of peers, at a peer that announces itself only once."""
+"""Requests for announcements, to a peer that does not announce itself again."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def peer(node, tmp_path):
 
 
 def test_a_peer_announces_itself_again_on_request(node, peer):
-    """Its announcement arrives at each port of discovery of the process that requests it."""
+    """The peer's announcement arrives at each port of discovery of the process that requests it."""
     domain = node.context.get_domain_id()
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as port:
         port.bind(("", PORT + 250 * domain))

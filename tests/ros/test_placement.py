@@ -108,7 +108,8 @@ def test_an_idle_cluster_is_quiet(narrow) -> None:
             while time.monotonic() < until:
                 participant.spin(0.05)
 
-        # This shows that it is discovered. The last interval between renewals is half a minute.
+        # The first request shows that DDS discovered this server. Renewals end at one per half
+        # minute.
         wait_until(lambda: seen, "a renewal", timeout=2 * PATIENCE, pause=participant.spin)
         for _ in range(8):  # the first intervals are shorter
             seen.clear()

@@ -38,7 +38,11 @@ class CpuOptions:
     group: str | None = None
 
     def __post_init__(self) -> None:
-        """Raise `ValueError` for a long window, or a group with a scope other than "cgroup"."""
+        """Check the options.
+
+        Raises:
+            ValueError: the window is too long, or a group has a scope other than "cgroup".
+        """
         check_window(self.window)
         check_group(self.group, self.scope)
 

@@ -39,7 +39,9 @@ class NetworkOptions:
     def __post_init__(self) -> None:
         """Raise `ValueError` for a capacity or a window that is out of range."""
         if self.capacity is not None and not self.capacity > 0.0:
-            raise ValueError(f"capacity {self.capacity!r} is not greater than 0")
+            raise ValueError(
+                f"`capacity` is {self.capacity!r}; it must be greater than 0 bytes a second"
+            )
         check_window(self.window)
 
 

@@ -220,7 +220,8 @@ def _follow(
             process=process.name, host=instance.host.name,
             facts={"number": instance.id.number, "pid": status.pid, "restarts": status.restarts},
         )  # fmt: skip
-        # The journal still has the phase before the loss, with its start.
+        # Do not save the phase before the loss of the host again: the journal has it, with its
+        # start time.
         is_saved = former is not None and former[0] is phase
         if phase in (ProcessPhase.RUNNING, ProcessPhase.BACKOFF) and not is_saved:
             state.save(process)

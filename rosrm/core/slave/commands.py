@@ -21,7 +21,8 @@ class Launch:
     """Order the supervisor to start instances.
 
     Attributes:
-        slots: start them once fewer other instances than this have not ended; 0: start at once.
+        slots: start them once fewer than this number of other instances are active, that is,
+            neither held nor ended; 0: start them at once.
     """
 
     assignments: tuple[Assignment, ...]

@@ -134,13 +134,13 @@ class SupervisorReplaced:
         statuses: statuses of all its instances.
         memos: facts about instances that earlier runs of this slave stored there.
         fenced: instances with a fence.
-        holds: it can hold a start until a slot is free.
+        holds_starts: the new supervisor can hold a start until a slot is free.
     """
 
     statuses: tuple[InstanceStatus, ...]
     memos: Mapping[InstanceId, Memo] = field(default_factory=dict)
     fenced: frozenset[InstanceId] = frozenset()
-    holds: bool = False
+    holds_starts: bool = False
 
 
 @dataclass(frozen=True, slots=True)

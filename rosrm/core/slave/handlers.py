@@ -30,8 +30,9 @@ REMEMBER_END: Final = 60.0
 #: Highest number of tombstones.
 _TOMBSTONES: Final = 10_000
 
-#: Seconds after which a wait is reported: most waits for other starts are shorter, and each report
-#: costs the master as much as that of a start. Far below `delivery_timeout`.
+#: Seconds after which a wait is reported, because most waits for other starts are shorter, and a
+#: report of one costs the master as much as that of a start. Far below `delivery_timeout`;
+#: otherwise the master would withdraw the assignment.
 REPORT_WAIT: Final = 0.5
 
 #: States in which an instance has a process.
@@ -86,7 +87,7 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
 
 
 def _report_waits(state: SlaveState, now: float) -> _Commands:
-    """Report the instances that have waited for a while."""
+    """Report the held instances that have waited for `REPORT_WAIT`."""
     waits = []
     for instance, due in list(state.unreported.items()):
         held = state.held.get(instance)
@@ -137,18 +138,18 @@ def _start_waiting(state: SlaveState, now: float) -> _Commands:
     launches = [state.waiting.pop(instance) for instance in started]
     for instance in started:
         state.held[instance].status = InstanceStatus(instance, InstanceState.STARTING)
-    ahead = _handed_ahead(state)
-    return [*([commands.Launch(tuple(launches))] if launches else []), *ahead, *refused]
+    held_launch = _launch_held(state)
+    return [*([commands.Launch(tuple(launches))] if launches else []), *held_launch, *refused]
 
 
-def _handed_ahead(state: SlaveState) -> _Commands:
-    """Hand the next instance to the supervisor, which starts it when a slot becomes free.
+def _launch_held(state: SlaveState) -> _Commands:
+    """Return the launch of the next job, which the supervisor holds until a slot is free.
 
-    It counts as one that runs, so there is at most one. All others are ready, so nothing that the
-    supervisor does not know yet takes a slot.
+    A job that was handed over counts as running, so there is at most one. All other instances must
+    be ready; otherwise the supervisor might not know one of them yet, and count its slot as free.
     """
     following = next(iter(state.waiting.values()), None)
-    if following is None or not (state.holds and state.max_processes and state.slots() == 0):
+    if following is None or not (state.holds_starts and state.max_processes and state.slots() == 0):
         return []
     ready = all(
         held.status.state is InstanceState.READY
@@ -320,7 +321,7 @@ def _supervisor_replaced(
     state: SlaveState, event: events.SupervisorReplaced, now: float
 ) -> _Commands:
     known = {status.instance for status in event.statuses}
-    state.holds = event.holds
+    state.holds_starts = event.holds_starts
     again: _Commands = []
     for instance, held in list(state.held.items()):
         lost = instance not in known and instance not in state.waiting
@@ -374,7 +375,7 @@ def _follow(
         else:
             held.status = _running(held, reported, now)
     elif reported.state is held.status.state is InstanceState.HELD:
-        return None  # known since the slave has handed it to the supervisor
+        return None  # the slave set this state when it received the assignment
     else:
         held.ready_by = held.steering = held.loading = None
         held.status = _with_unready(held, reported)

@@ -145,8 +145,8 @@ class SlaveState:
         nodes: those of `alive` with a node in the ROS graph, because the loop of the slave checks
             them in each turn, and most jobs have no node.
         waiting: assignments that start as soon as the bounds allow, in order.
-        unreported: held instances whose wait is not reported yet, with the time at which it is.
-        holds: the supervisor can hold a start until a slot is free.
+        unreported: held instance to the time at which its wait will be reported.
+        holds_starts: the supervisor can hold a start until a slot is free.
         tombstones: ended and refused instances, which never start on this host again.
     """
 
@@ -163,7 +163,7 @@ class SlaveState:
     nodes: dict[InstanceId, HeldInstance] = field(default_factory=dict)
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     unreported: dict[InstanceId, float] = field(default_factory=dict)
-    holds: bool = False
+    holds_starts: bool = False
     tombstones: dict[InstanceId, None] = field(default_factory=dict)
 
     def hold(self, instance: InstanceId, held: HeldInstance) -> HeldInstance:
@@ -234,7 +234,7 @@ class SlaveState:
     def why_wait(self) -> str:
         """Return the reason why instances wait; call this when none of them may start."""
         if self.slots() <= 0:
-            return "waits for a free slot there"
+            return f"waits for a free slot (max_processes: {self.max_processes})"
         return f"waits until others there have started (max_starting: {self.max_starting})"
 
     def starting(self) -> int:

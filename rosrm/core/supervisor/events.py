@@ -14,7 +14,8 @@ class StartOrdered(NamedTuple):
         fence: None: no deadline stops the instance, even without contact to the master.
         heard: last contact: newest time known to the client at which the master received a message
             of this host; None: now.
-        slots: start once fewer other instances than this have not ended; 0: start at once.
+        slots: start once fewer than this number of other instances are active, that is, neither
+            held nor ended; 0: start at once.
     """
 
     instance: Key

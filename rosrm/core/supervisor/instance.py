@@ -62,7 +62,7 @@ class Instance:
         fenced: text on why it was fenced; "": not fenced, or already being stopped for good.
         kill_by: latest time of SIGKILL after it was fenced; None: not fenced.
         withdrawn: the shutdown of the supervisor stops it, not an order of the client.
-        slots: number of other instances below which a held one starts; 0: it is never held.
+        slots: it starts once fewer than this number of others are active; 0: it is never held.
         adopted: its last run was started without rosrm, so its exit code is never known.
     """
 

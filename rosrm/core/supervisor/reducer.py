@@ -2,7 +2,7 @@
 
     phase     event            commands and signals                          next phase
     -         StartOrdered     Spawn                                         starting
-                               its slots are taken by others: -              held
+                               all its slots are taken: -                    held
                                its number is dead, or in a shutdown: -       refused
     -         StopOrdered      - (a later order to start is refused)         refused
               FenceOrdered     -                                             refused
@@ -56,8 +56,9 @@ policy and of later orders.
 before ends as withdrawn, not exited. So the master can distinguish this end from an end by its own
 order or by the process.
 
-`SlotFreed` occurs when the end of another instance leaves fewer of them than the `slots` of a held
-one, also without a client: the client has handed it over to start without a further order.
+`SlotFreed` occurs when fewer than `slots` instances other than a held one are active, that is,
+neither held nor ended. The supervisor needs no client for this start, because it already has the
+order.
 
 `ClientLost` changes nothing: each instance runs on as long as its fence allows.
 
@@ -214,7 +215,8 @@ class SupervisorState:
             instance = Instance(event.instance, event.restart, event.stop)
             instance.fence, instance.slots = event.fence, event.slots
             if event.slots:
-                instance.phase, instance.message = HELD, "waits for a free slot there"
+                instance.phase = HELD
+                instance.message = f"waits for a free slot (max_processes: {event.slots})"
             slave_counts = event.fence is not None and event.fence.alive
             known = None if slave_counts else event.heard
             instance.heard = now if known is None else min(known, now)

@@ -79,7 +79,10 @@ class RivalWatch:
         self.ask(now, answered)
 
     def ask(self, now: float, answered: Callable[[srv.Handshake.Response | None], None]) -> None:
-        """Send a handshake to all other masters; `answered` gets an answer, or None in the end."""
+        """Send a handshake to all other masters.
+
+        `answered` is called with an answer, or with None after `_PATIENCE` seconds.
+        """
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="master",
             name=self._identity.as_client,

@@ -1,8 +1,9 @@
 """Search of a starting master for a running one (docs/decisions/0066).
 
-The master beats and offers its services already, so that slaves without a master register. Until
-the search ends, nothing is decided: registrations wait among the events, handshakes of clients and
-other masters wait for their answers, and requests for other runs are left to those runs.
+During the search the starting master sends beats and offers its services, so that slaves without a
+master register. The master decides nothing yet: registrations wait as events, handshakes of clients
+and other masters wait for their answers, and requests for another run get no answer, because that
+run may still answer them.
 """
 
 from __future__ import annotations
@@ -17,12 +18,12 @@ from rosrm.ros.master.endpoint import MasterEndpoint
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm_msgs import srv
 
-#: Seconds between two handshakes with any other master.
+#: Seconds between two handshakes that are sent to all other masters.
 ASK_EVERY: Final = 0.1
 
 
 class MasterSearch:
-    """The search; it begins at once.
+    """Search for another master; creating the object begins the search.
 
     Args:
         endpoints, endpoint: of the starting master.
@@ -35,7 +36,7 @@ class MasterSearch:
         self._endpoints, self._endpoint = endpoints, endpoint
         self.found: srv.Handshake.Response | None = None
         endpoints.refuses_other_runs = False
-        endpoint.services.hold_greetings()
+        endpoint.services.hold_handshakes()
 
     def ask(self, now: float) -> None:
         """Ask all other masters for a handshake; to be called every `ASK_EVERY` seconds."""
@@ -46,7 +47,7 @@ class MasterSearch:
         self.found = self.found or answer
 
     def has_ended(self, hosts: Collection[str]) -> bool:
-        """Return True if a master was found, or no other master has a host of the journal.
+        """Return True if another master answered, or none can have a host of the journal.
 
         A slave without a master registers with the first one that answers. So if all hosts of the
         journal wait here for their registration, no other master has one of them.
@@ -60,12 +61,12 @@ class MasterSearch:
         return registering.issuperset(hosts)
 
     def end(self) -> None:
-        """Answer everything that waits, because this master starts."""
+        """Answer the held handshakes, and refuse requests for other runs again."""
         self._endpoints.refuses_other_runs = True
-        self._endpoint.services.answer_greetings()
+        self._endpoint.services.answer_held_handshakes()
 
-    def give_way(self, reason: str) -> None:
-        """Send the waiting slaves back to their search, because another master was found."""
+    def refuse_registrations(self, reason: str) -> None:
+        """Refuse the waiting registrations with `journal`: the slaves then find that master."""
         for event in self._endpoint.take_events():
             if isinstance(event, happened.HostRegistered):
                 self._endpoint.services.reply(Reply(event.request, False, "journal", reason))

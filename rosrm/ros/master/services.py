@@ -44,7 +44,7 @@ _Respond = Callable[[Any], None]
 
 #: Most letters of the name of a client or peer in records.
 _LONGEST_PEER: Final = 200
-#: Handshakes of clients and masters that are held; senders repeat theirs.
+#: Most held handshakes of clients and masters; more are dropped, because senders repeat them.
 _MOST_HELD: Final = 2000
 #: Seconds for which an introduction to a newly registered slave waits for its first reading.
 _FIRST_READING: Final = 1.0
@@ -277,12 +277,12 @@ class MasterServices:
             )
         )  # fmt: skip
 
-    def hold_greetings(self) -> None:
-        """Leave the handshakes of clients and other masters open until `answer_greetings`."""
+    def hold_handshakes(self) -> None:
+        """Leave the handshakes of clients and other masters open until `answer_held_handshakes`."""
         self._held = []
 
-    def answer_greetings(self) -> None:
-        """Answer the handshakes that were held, and later ones at once."""
+    def answer_held_handshakes(self) -> None:
+        """Answer the held handshakes; answer later ones at once."""
         held, self._held = self._held or [], None
         for request, open_request in held:
             self._endpoints.participant.guard.call(self._take_handshake, request, open_request)

@@ -438,7 +438,7 @@ class SlaveEndpoint:
     def note_journal(self, journal: int, epoch: int) -> None:
         """Store the watermark of the journal that came with an assignment.
 
-        An assignment of a former run of the master has another epoch.
+        An assignment of a former run of the master has another epoch, and its watermark is ignored.
         """
         if journal and epoch == self.epoch:
             self._seen.note(Watermark(journal, self._incarnation, self.cluster))

@@ -104,7 +104,7 @@ class SlaveServices:
 
     Args:
         max_age: seconds after which an order is stale.
-        endpoint: knows the newest epoch of the master; older orders are refused.
+        endpoint: has the newest epoch of the master; older orders are refused.
     """
 
     def __init__(
@@ -158,7 +158,7 @@ class SlaveServices:
         respond(srv.ControlHost.Response(answer=accepted()))
 
     def acknowledge_starts(self) -> None:
-        """Answer the orders to start; called after the launches, which would wait for this."""
+        """Answer the orders to start. Call this after the launches; before, it would delay them."""
         started, self._started = self._started, []
         for respond in started:
             respond(srv.ControlHost.Response(answer=accepted()))

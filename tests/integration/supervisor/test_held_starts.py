@@ -19,7 +19,9 @@ def held(host, client):
 
 
 @pytest.mark.parametrize("supervised", [True, False], ids=["no slave", "no supervisor"])
-def test_a_held_process_starts_if_its_slot_became_free_unseen(host, client, supervised):
+def test_a_held_process_starts_if_its_slot_became_free_without_slave_or_supervisor(
+    host, client, supervised
+):
     """The supervisor needs no slave for the start; the next supervisor finds the free slot."""
     pid = held(host, client)
     client.close() if supervised else host.kill_supervisor(client)
@@ -41,7 +43,7 @@ def test_a_held_process_starts_after_a_take_over(host, client):
 
 
 def test_a_held_process_that_was_stopped_never_starts(host, client):
-    """Its final status shows that nothing ran."""
+    """The final status shows a run time of 0."""
     pid = held(host, client)
     client.send(StopOrdered(("next", 1)))
     assert host.ended(client, "next").run_time == 0.0

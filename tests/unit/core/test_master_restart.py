@@ -65,7 +65,7 @@ def test_running_processes_keep_running_and_are_not_started_twice() -> None:
 
 
 def test_a_process_that_runs_as_before_is_not_written_again() -> None:
-    """The journal has its phase with the start of that phase, as the next master would write it."""
+    """The journal already has the phase and its start, exactly as this master would write them."""
     cluster = Cluster("a").with_processes(process("p"))
     written = cluster.intents["process"]["p"]
     cluster.wait(5.0)

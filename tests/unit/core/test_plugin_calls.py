@@ -115,7 +115,10 @@ def test_a_reason_that_is_no_text_is_named_with_the_place_of_the_method() -> Non
 
 
 def test_a_call_within_a_call_of_the_same_plugin_has_no_time_out_of_its_own() -> None:
-    """The outer call's covers it, also after a failure; another plugin has one of its own."""
+    """The time-out of the outer call covers the inner one, also after a failure.
+
+    Another plugin has its own time-out.
+    """
     limited: list[Plugin] = []
 
     def limit(plugin: Plugin, call: Callable[[], Any]) -> Any:

@@ -86,7 +86,7 @@ def test_an_order_for_the_core_becomes_its_event(order, event):
 
 
 def test_a_start_has_the_watermark_of_the_journal():
-    """Without one, in an order from another source than an assignment, it is 0."""
+    """A START that no assignment caused has none, which reads as 0."""
     start = StartInstance(ASSIGNMENT)
     request = start_to_msg(start, 41)
     assert (journal_of(request), order_from_msg(request)) == (41, start)

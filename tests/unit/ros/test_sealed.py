@@ -86,7 +86,7 @@ def test_a_request_whose_handler_raises_is_answered_as_failed(caplog, kind, name
 
 @pytest.mark.parametrize("refuses", [True, False])
 def test_a_request_for_another_run_is_left_to_that_run(refuses) -> None:
-    """A starting master does not answer as stale what a running master may accept."""
+    """A starting master does not answer `stale` to a request that a running master may accept."""
     key = ClusterSecret(bytes(32)).key_of(own_grant(Principal("host", "robot-1")))
     service = Service(
         srv.ReadLog, "/read_log", lambda *_: pytest.fail("it was handled"), MemberSecurity(key)

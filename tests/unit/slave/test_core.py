@@ -438,7 +438,7 @@ def nodes(count: int) -> AssignmentsReceived:
 
 
 def test_at_most_max_starting_instances_start_at_a_time() -> None:
-    """The others are held and reported; the next one starts once one is ready."""
+    """The others are held, and reported after `REPORT_WAIT`; the next starts once one is ready."""
     one = Slave(max_starting=2)
     assert launched(one.step(nodes(4))) == [InstanceId("n0", 1), InstanceId("n1", 1)]
     assert states(one.step(TimePassed(), after=REPORT_WAIT)) == [STATE.HELD, STATE.HELD]

@@ -17,7 +17,7 @@ FIRST, NEXT, LAST = ("first", 1), ("next", 2), ("last", 3)
 FENCE = FenceRule(after=10.0, grace=3.0)
 
 
-def start(core, key, slots=1, restart=RestartRule("never"), fence=None):  # noqa: B008 - a named tuple
+def start(core, key, slots=1, restart=RestartRule("never"), fence=None):  # noqa: B008
     """Order a start at time 0; return the instances that are spawned."""
     ordered = events.StartOrdered(key, restart, StopRule(), fence, 0.0, slots)
     return spawns(core.handle(ordered, 0.0))
@@ -46,7 +46,7 @@ def test_a_held_start_begins_when_the_other_has_ended(core):
 
 
 def test_held_starts_begin_in_order(core):
-    """Each one takes the free slot from those behind it."""
+    """The first one takes the free slot."""
     start(core, LAST)
     assert spawns(core.handle(events.Exited(FIRST), 1.0)) == [NEXT]
     core.handle(events.Spawned(NEXT, 101), 1.0)
@@ -59,7 +59,7 @@ def test_a_start_with_a_free_slot_begins_at_once(core):
 
 
 def test_an_instance_that_waits_for_its_restart_keeps_its_slot(core):
-    """A crash of the other is no end, so its restart and the held start do not run at once."""
+    """A crashed instance has not ended, so the held start does not run beside its restart."""
     assert spawns(core.handle(events.Exited(FIRST, 1), 1.0)) == []
     assert core.instances[FIRST].phase == BACKOFF
 
@@ -75,7 +75,7 @@ def test_an_instance_that_waits_for_its_restart_keeps_its_slot(core):
     ids=lambda value: type(value).__name__,
 )
 def test_a_held_start_that_is_stopped_never_begins(core, event, phase):
-    """A stop, a fence in time or by order, and a shutdown end it, and free nothing for it."""
+    """A stop, a fence (in time or by order) and a shutdown end a held start for good."""
     core.handle(event, 10.0)
     instance = core.instances[NEXT]
     assert (instance.phase, instance.run_time) == (phase, 0.0)

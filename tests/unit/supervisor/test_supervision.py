@@ -725,7 +725,7 @@ class Host(RuleBasedStateMachine):
 
     @invariant()
     def what_is_held_waits_for_a_slot(self):
-        """Check that nothing is held longer than others take its slots."""
+        """Check that every held instance has no free slot."""
         active = sum(self.takes_slot(instance) for instance in self.core.instances.values())
         for key, instance in self.core.instances.items():
             assert instance.phase != HELD or active >= instance.slots, key

@@ -69,7 +69,7 @@ class World(ABC, Generic[HostT]):
         """Send an order to a slave."""
 
     def assign(self, host: HostT, command: Assign) -> None:
-        """Hand an assignment to a host with the answer to its open request."""
+        """Send an assignment to a host that has requested work."""
         host.polled.append(command.assignment)
 
     def after(self, _seconds: float, action: Callable[[], object]) -> None:

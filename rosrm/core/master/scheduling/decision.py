@@ -105,19 +105,19 @@ class Moment:
         return [self._part(link, scored, others) for link in self.judges]
 
     def _part(self, link: ScoringLink, scored: Sequence[int], others: Sequence[int]) -> Part:
-        """Return scores and reasons of a policy, from one call with a time-out."""
+        """Return scores and reasons of a policy; one call with one time-out covers both."""
         views = host_view(self.hosts), process_view(self.hosts, link.reads)
 
-        def part() -> Part:
+        def scores_and_reasons() -> Part:
             scores = required(link.policy.score(*views), Scores)
             vetoed = [at for at in others if scores.veto is not None and scores.veto[at]]
             reasons = self._reasons(link, scores, "reason", scored)
             return Part(link, scores, reasons | self._reasons(link, scores, "veto_reason", vetoed))
 
         try:
-            return self.plugins.ask("scoring", link.name, "score", part, link.policy)
+            return self.plugins.ask("scoring", link.name, "score", scores_and_reasons, link.policy)
         except PluginError as error:  # the decision itself does not need the reasons
-            return Part(link, None, _failed(scored, error))
+            return Part(link, None, _failure_notes(scored, error))
 
     def _reasons(
         self, link: ScoringLink, scores: Scores, hook: str, rows: Sequence[int]
@@ -131,7 +131,7 @@ class Moment:
         try:
             return self.plugins.ask("scoring", link.name, hook, reasons, scores) if rows else {}
         except PluginError as error:
-            return _failed(rows, error)
+            return _failure_notes(rows, error)
 
     @property
     def plugins(self) -> PluginCalls:
@@ -294,6 +294,6 @@ def _vetoes(parts: Sequence[Part], at: int) -> str:
     return "; ".join(f"{part.link.name}: {part.reasons[at]}" for part in vetoes)
 
 
-def _failed(rows: Sequence[int], error: PluginError) -> dict[int, str]:
-    """Return a note instead of the reasons of a policy that has failed."""
+def _failure_notes(rows: Sequence[int], error: PluginError) -> dict[int, str]:
+    """Return for each row a note in place of the reason, because the policy has failed."""
     return dict.fromkeys(rows, f"(no reason, because the policy failed: {error})")

@@ -32,7 +32,7 @@ class ServingWire(Wire):
         self.handlers[kind] = handle
 
 
-class Request:
+class FakeRequest:
     """A genuine request, with its answers."""
 
     def __init__(self, principal: Principal) -> None:
@@ -47,7 +47,7 @@ class Request:
         self.answers.append(response)
 
 
-class Start:
+class StartingMaster:
     """A starting master without ROS."""
 
     def __init__(self) -> None:
@@ -63,16 +63,16 @@ class Start:
         )  # fmt: skip
         self.search = MasterSearch(self.wire, endpoint)
 
-    def greet(self, role: str, name: str) -> Request:
-        request = Request(Principal("host" if role == "slave" else "user", name))
+    def send_handshake(self, role: str, name: str) -> FakeRequest:
+        request = FakeRequest(Principal("host" if role == "slave" else "user", name))
         handshake = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, role=role, name=name
         )  # fmt: skip
         self.wire.handlers[srv.Handshake](handshake, request)
         return request
 
-    def register(self, name: str, beat: int) -> Request:
-        request = Request(Principal("host", name))
+    def register(self, name: str, beat: int) -> FakeRequest:
+        request = FakeRequest(Principal("host", name))
         envelope = msg.Envelope(
             protocol_version=PROTOCOL_VERSION, request_id=name, receiver_beat=beat
         )
@@ -84,26 +84,26 @@ class Start:
 
 
 @pytest.fixture
-def start() -> Start:
-    return Start()
+def start() -> StartingMaster:
+    return StartingMaster()
 
 
 def test_a_slave_can_register_and_waits_for_the_decision(start) -> None:
-    """Its handshake is answered, its registration is an event for the core."""
-    (greeting,) = start.greet("slave", "h0").answers
-    registration = start.register("h0", greeting.beat)
+    """The slave's handshake is answered; the registration waits as an event for the core."""
+    (handshake,) = start.send_handshake("slave", "h0").answers
+    registration = start.register("h0", handshake.beat)
     assert [event.description.name for event in start.events] == ["h0"]
     assert not registration.answered
 
 
 @pytest.mark.parametrize("role", ["client", "master"])
-def test_clients_and_masters_are_greeted_after_the_search(start, role) -> None:
+def test_handshakes_of_clients_and_masters_are_answered_after_the_search(start, role) -> None:
     """A client must not find a master that may end at once."""
-    request = start.greet(role, "ada")
+    request = start.send_handshake(role, "ada")
     assert not request.answered
     start.search.end()
     assert [answer.pid for answer in request.answers] == [IDENTITY.pid]
-    assert start.greet(role, "ada").answered
+    assert start.send_handshake(role, "ada").answered
 
 
 @pytest.mark.parametrize(
@@ -123,14 +123,14 @@ def test_the_search_ends_when_all_hosts_of_the_journal_register(
 
 
 def test_a_master_that_answers_ends_the_search(start) -> None:
-    """The registered slaves are sent back, so that they find that master."""
-    (greeting,) = start.greet("slave", "h0").answers
-    registration = start.register("h0", greeting.beat)
+    """The waiting slaves are refused, so that they find that master."""
+    (handshake,) = start.send_handshake("slave", "h0").answers
+    registration = start.register("h0", handshake.beat)
     start.search.ask(100.0)
     (asked,) = start.wire.to[srv.Handshake].sent
     assert (asked.request.role, asked.request.name) == ("master", IDENTITY.as_client)
     asked.answer(srv.Handshake.Response(protocol_version=PROTOCOL_VERSION, pid=9))
     assert start.search.has_ended(["h0", "h1"])
     assert start.search.found.pid == 9
-    start.search.give_way("a master runs already")
+    start.search.refuse_registrations("a master runs already")
     assert [answer.answer.code for answer in registration.answers] == ["journal"]

@@ -255,7 +255,7 @@ def test_a_single_assignment_is_an_order_with_beat_and_journal(links, poll):
 
 
 def test_several_assignments_are_one_answer(links, poll):
-    """A burst of orders would overflow the slave's socket, and lost ones come 2 s later."""
+    """A burst of orders would overflow the slave's socket; lost orders are repeated after 2 s."""
     for name in ("one", "two"):
         links.assign(Assign(HOST, assignment(name, 0)))
     links.flush(41)

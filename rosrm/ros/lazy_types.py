@@ -1,7 +1,7 @@
 """Import of the types of `rosrm_msgs` one by one, on first use.
 
 The generated packages `rosrm_msgs.msg` and `rosrm_msgs.srv` import all of their types, which takes
-5 MiB and tens of milliseconds. A slave or a command uses a third of them.
+4 MiB and tens of milliseconds. A slave or a command uses a third of them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _PART_OF_SERVICE: Final = re.compile(r"_(Request|Response|Event)$")
 _WORD: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=.)(?=[A-Z][a-z])")
 
 
-class _OnUse:
+class _LazyPackageLoader:
     """Loader of a generated package; it does not execute the package's `__init__`."""
 
     def create_module(self, _: ModuleSpec) -> None:
@@ -33,7 +33,7 @@ class _OnUse:
 
 
 class _Finder:
-    """Finds the generated packages before the usual finders do."""
+    """Finder of the generated packages, ahead of the usual finders."""
 
     @staticmethod
     def find_spec(
@@ -42,7 +42,8 @@ class _Finder:
         """Return the spec of a generated package, with another loader; None for other modules."""
         spec = PathFinder.find_spec(name, path) if name in _PACKAGES else None
         if spec is not None:
-            spec.loader = cast(Any, _OnUse())  # `importlib.abc`, the base class, needs half a MiB
+            # Not derived from the class of `importlib.abc`, whose import needs half a MiB.
+            spec.loader = cast(Any, _LazyPackageLoader())
         return spec
 
 
@@ -59,6 +60,6 @@ def _imported(package: ModuleType, name: str) -> Any:
     return found
 
 
-def import_types_on_use() -> None:
-    """Let later imports of the generated packages import no type."""
+def import_types_lazily() -> None:
+    """Make the generated packages import each type on its first use."""
     sys.meta_path.insert(0, _Finder)

@@ -17,10 +17,10 @@ JOB = replace(PLAIN, kind=Kind.JOB)
 HELD, RUNNING, EXITED = InstanceState.HELD, InstanceState.RUNNING, InstanceState.EXITED
 
 
-def slave(holds=True, slots=1):
-    """Return a slave with one slot, in which a job runs."""
+def slave(holds_starts=True, slots=1):
+    """Return a slave with slots, in one of which a job runs."""
     one = Slave(max_processes=slots)
-    one.step(SupervisorReplaced((), holds=holds))
+    one.step(SupervisorReplaced((), holds_starts=holds_starts))
     one.assign(JOB)
     one.status(RUNNING)
     return one
@@ -36,7 +36,7 @@ def test_the_next_job_is_handed_over_and_reported_as_held():
 
 
 def test_one_job_is_handed_over_at_a_time():
-    """The one behind it follows once the held one runs, so the order of the queue is kept."""
+    """The next job follows once the held one runs, so the order of the queue is kept."""
     one = slave()
     one.assign(JOB, 2)
     assert launched(one.assign(JOB, 3)) == []
@@ -45,7 +45,7 @@ def test_one_job_is_handed_over_at_a_time():
 
 
 def test_a_held_job_is_launched_once():
-    """The report of the supervisor that it holds the job changes nothing; a repeat neither."""
+    """A report that the job is held changes nothing; nor does a repeated assignment."""
     one = slave()
     one.assign(JOB, 2)
     assert one.status(HELD, number=2) == []
@@ -70,7 +70,7 @@ def test_a_stop_of_a_held_job_goes_to_the_supervisor():
     ],
     ids=["service", "node", "adopted", "snapshot", "restored"],
 )
-def test_what_needs_the_slave_at_its_start_is_not_handed_over(spec, more):
+def test_a_start_that_needs_the_slave_is_not_handed_over(spec, more):
     """The slave fetches files, awaits nodes and adopts processes at the start itself."""
     one = slave()
     assert launched(one.assign(spec, 2, **more)) == []
@@ -79,13 +79,13 @@ def test_what_needs_the_slave_at_its_start_is_not_handed_over(spec, more):
 
 def test_nothing_is_handed_to_a_supervisor_that_would_start_it_at_once():
     """A supervisor of an earlier version ignores the bound."""
-    one = slave(holds=False)
+    one = slave(holds_starts=False)
     assert launched(one.assign(JOB, 2)) == []
     assert launched(one.status(EXITED)) == [InstanceId("p", 2)]
 
 
 def test_nothing_is_handed_over_while_another_one_starts():
-    """The supervisor may not know that one yet, and would count its slot as free."""
+    """The supervisor may not know the starting instance yet, and would count its slot as free."""
     one = slave(slots=2)
     one.assign(JOB, 2)
     assert launched(one.assign(JOB, 3)) == []
@@ -98,7 +98,7 @@ def test_a_held_job_of_a_former_run_of_the_slave_keeps_its_turn():
     statuses = (
         InstanceStatus(InstanceId("p", 1), RUNNING, pid=5), InstanceStatus(InstanceId("p", 2), HELD)
     )  # fmt: skip
-    assert states(one.step(SupervisorReplaced(statuses, holds=True)))[-1] is HELD
+    assert states(one.step(SupervisorReplaced(statuses, holds_starts=True)))[-1] is HELD
     one.assign(JOB, 3)
     assert launched(one.status(EXITED)) == []
     assert launched(one.status(RUNNING, number=2)) == [InstanceId("p", 3)]
