@@ -246,9 +246,16 @@ class SupervisorLink:
         """Repeat the launch orders that no supervisor has acknowledged; return their statuses."""
         for status in client.instances:
             self._unanswered.pop(status.instance, None)
+        if not client.holds_starts:  # an earlier version would start a held job at once
+            self._unanswered = {
+                one: order for one, order in self._unanswered.items() if not order.slots
+            }
         with contextlib.suppress(SupervisorGone):
             client.start(list(self._unanswered.values()))
-        return [InstanceStatus(one, InstanceState.STARTING) for one in self._unanswered]
+        return [
+            InstanceStatus(one, InstanceState.HELD if order.slots else InstanceState.STARTING)
+            for one, order in self._unanswered.items()
+        ]
 
     def _replace(self, client: SupervisorClient) -> None:
         """Replace the connection, and re-adopt the instances."""

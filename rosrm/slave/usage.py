@@ -30,7 +30,6 @@ class UsageWatch:
         self._sessions = sessions
         self._group_of = group_of
         self._leaders: dict[InstanceId, int] = {}
-        self._starting: set[InstanceId] = set()
         self._seen: Mapping[int, SessionUsage] = {}
         self._publish_in = 0
 
@@ -41,14 +40,6 @@ class UsageWatch:
         if leader and (leader != status.pid or not runs):
             self._sessions.remove(leader, status.cpu_time)
             del self._leaders[status.instance]
-        elif status.state.ended and status.instance in self._starting:
-            # The instance ended before it was seen running, and its CPU time counts too. The time
-            # of an instance that ended before this slave started does not.
-            self._sessions.remove(status.pid, status.cpu_time)
-        if status.state is InstanceState.STARTING:
-            self._starting.add(status.instance)
-        else:
-            self._starting.discard(status.instance)
         if runs and status.instance not in self._leaders:
             self._sessions.add(status.pid, self._group_of(status.instance))
             self._leaders[status.instance] = status.pid

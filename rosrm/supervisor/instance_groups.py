@@ -197,6 +197,9 @@ class InstanceGroups:
                 self._homes[home] = os.open(tasks, os.O_WRONLY | os.O_CLOEXEC)
             os.write(self._homes[home], b"0")
         except OSError as error:
+            unusable = self._homes.pop(home, None)
+            if unusable is not None:
+                os.close(unusable)
             own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
 
     def members(self, key: Key) -> list[int] | None:

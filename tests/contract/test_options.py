@@ -45,7 +45,7 @@ def test_defaults_survive_the_way_to_the_slave(name):
         ("cpu", {"scope": "container"}, "machine"),
         ("cpu", {"window": 0}, "greater than 0"),
         ("disk", {"walk_period": -1}, "greater than 0"),
-        ("gpu", {"devices": [-1]}, "greater than or equal to 0"),
+        ("gpu", {"devices": [-1]}, "is not within 0"),
         ("gpu", {"combine": "sum"}, "'max' or 'mean'"),
         ("network", {"capacity": 0}, "greater than 0"),
         ("network (scoring)", {"round_trip": 0}, "greater than 0"),

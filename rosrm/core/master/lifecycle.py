@@ -144,7 +144,9 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     if status.state in _ALIVE:
         instance.recalled = False
-    if status.state in _RESTARTS:
+    # After a back-off before the first run, the slave need not report the new start as one.
+    started_at_last = before is InstanceState.BACKOFF and status.state in _ALIVE
+    if status.state in _RESTARTS or started_at_last:
         instance.restarting = False
     process = state.owned_by(instance)
     if process is None:

@@ -41,7 +41,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.limits import limits_fault
 from rosrm.model.orders import RestartInstance
 from rosrm.model.requester import Requester
-from rosrm.model.values import ProcessSpec
+from rosrm.model.values import InstanceState, ProcessSpec
 from rosrm.wording import MOST_COMPARED, counted, listed, no_such
 
 #: Kind of the record of each action on a host.
@@ -378,9 +378,9 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         state.unqueue(process)
         allow_every_host(process)
         state.enqueue(process, now)
-    elif (owner := state.instances[process.owner]).state is not None:
-        # An instance that its slave has not accepted yet starts without this order. An order to
-        # restart that arrives before the assignment would prevent the start for good.
+    elif (owner := state.instances[process.owner]).state not in (None, InstanceState.HELD):
+        # An instance that has not started yet starts without this order. An order to restart that
+        # arrives before the assignment would prevent the start for good.
         owner.restarting = True
         state.send(owner.host, RestartInstance(owner.id))
     state.save(process)

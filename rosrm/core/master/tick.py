@@ -76,7 +76,7 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
     age = now - instance.since
     if instance.state is None:
         _review_delivery(state, instance, age, now)
-    if waits_too_long(instance, now):
+    if waits_too_long(state, instance, now):
         _cancel_prefetch(state, instance, now)
     if instance.stopping and now - instance.order_at >= state.settings.order_retry:
         stop_instance(state, instance, now)

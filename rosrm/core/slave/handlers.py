@@ -66,8 +66,10 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
     refusals = []
     for assignment in event.assignments:
         instance = assignment.instance
-        if instance in state.held:
-            continue  # the order arrived twice
+        if instance in state.held:  # the order arrived twice: the master has no status yet
+            if instance in state.unreported:
+                state.unreported[instance] = now
+            continue
         status = _refused(state, assignment, event.given_at, now)
         if status is not None:
             state.hold(instance, HeldInstance(status, ended_at=now))
@@ -83,7 +85,8 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
     for one in held:
         state.held[one].status = replace(state.held[one].status, message=why)
         state.unreported.setdefault(one, now + REPORT_WAIT)
-    return [*launches, commands.Report(tuple(refusals))] if refusals else launches
+    reports = [commands.Report(tuple(refusals))] if refusals else []
+    return [*launches, *reports, *_report_waits(state, now)]
 
 
 def _report_waits(state: SlaveState, now: float) -> _Commands:
@@ -167,7 +170,7 @@ def _is_plain_job(assignment: Assignment) -> bool:
     spec = assignment.spec
     plain = spec.kind is Kind.JOB and not (spec.awaits_graph or spec.artifacts)
     plain = plain and not spec.container.image and spec.adoption == NO_ADOPTION
-    return plain and not assignment.snapshot_hosts and not assignment.restored
+    return plain and not assignment.has_snapshots and not assignment.restored
 
 
 def _refuse_late(state: SlaveState, now: float) -> _Commands:

@@ -7,10 +7,12 @@ discovered the slave's service, because it would be lost otherwise.
 
 from __future__ import annotations
 
+import logging
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Final
 
 from rosrm.core.master import events as happened
@@ -28,6 +30,8 @@ from rosrm.ros.orders import order_to_msg, start_to_msg
 from rosrm.ros.sealed import SealedClient, SealedEndpoints
 from rosrm.ros.sealed_readings import RegisteredSlave, reading_channel
 from rosrm_msgs import srv
+
+_log = logging.getLogger("rosrm.master")
 
 #: Most orders and requests of one slave that wait for its next reading, and most introductions to
 #: it, which users can request in any number.
@@ -309,8 +313,7 @@ class HostLinks:
         """Order the start of an assignment; the request for work stays open."""
         request = start_to_msg(StartInstance(assignment), journal)
         deadline = time.monotonic() + self._order_timeout
-        # The core needs no answer: the slave reports the instance, or the core redelivers it.
-        self._send(link, request, deadline, lambda _: None)
+        self._send(link, request, deadline, partial(_log_refusal, link, assignment))
 
     def _answer_poll(
         self, link: HostLink, respond: Callable[[Any], None], batch: Sequence[Assignment],
@@ -420,6 +423,17 @@ class HostLinks:
                 self._waiting.discard(host_id)
             for order in late:
                 order.done(None)
+
+
+def _log_refusal(
+    link: HostLink, assignment: Assignment, response: srv.ControlHost.Response | None
+) -> None:
+    """Log a refused START; the core repeats or withdraws it, as one without an answer."""
+    if response is not None and link.slave is not None and not response.answer.accepted:
+        _log.warning(
+            "%s refused to start %s: %s",
+            link.slave.peer.grant.principal, assignment.instance.process, response.answer.message,
+        )  # fmt: skip
 
 
 def _order_answered(

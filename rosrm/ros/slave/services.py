@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -113,7 +114,9 @@ class SlaveServices:
     ) -> None:  # fmt: skip
         self._duties = duties
         self._endpoint = endpoint
-        self._started: list[Callable[[Any], None]] = []
+        self._started: deque[Callable[[Any], None]] = deque()
+        # One for all: the answers to thousands of requests are remembered.
+        self._start_accepted = srv.ControlHost.Response(answer=accepted())
         path = names.Names(endpoints.participant.settings.namespace)
         server = ControlServer(endpoints, max_age, lambda: endpoint.epoch)
         server.offer(srv.ControlHost, path.of_host(host, names.CONTROL), self._take_order)
@@ -159,9 +162,8 @@ class SlaveServices:
 
     def acknowledge_starts(self) -> None:
         """Answer the orders to start. Call this after the launches; before, it would delay them."""
-        started, self._started = self._started, []
-        for respond in started:
-            respond(srv.ControlHost.Response(answer=accepted()))
+        while self._started:
+            self._started.popleft()(self._start_accepted)
 
     def _start(self, assignment: Assignment, request: srv.ControlHost.Request) -> None:
         self._endpoint.note_journal(journal_of(request), request.envelope.epoch)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import PROVED_LONG
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from tests.unit.core.cluster import Cluster, Machine, job
 
 
@@ -49,3 +51,26 @@ def test_a_prefetched_job_can_be_cancelled() -> None:
     cluster.submit(job("p"), job("q"))
     cluster.cancel("q")
     assert [cluster.phase(name) for name in "pq"] == ["running", "cancelled"]
+
+
+def test_a_held_job_that_is_restarted_runs_once() -> None:
+    """The job has not started yet, so a restart changes nothing."""
+    cluster = cluster_of_one_slot(run_time=0.1)
+    cluster.submit(job("p"), job("q"))
+    cluster.wait(1.0)
+    assert cluster.restart("q").accepted
+    cluster.finish("p", run_time=0.1)
+    cluster.finish("q", run_time=0.1)
+    assert cluster.phase("q") == "finished"
+
+
+def test_a_held_job_stays_on_a_detached_host() -> None:
+    """The supervisor of the host starts it in its turn, and no order to stop it would arrive."""
+    cluster = cluster_of_one_slot(run_time=0.1)
+    cluster.submit(job("p"), job("q"))
+    machine, held = cluster.machines["a"], InstanceId("q", cluster["q"].owner)
+    left = (*machine.begun(), InstanceStatus(held, InstanceState.HELD))
+    cluster.ask(happened.HostLeft, machine.host_id, machine.incarnation, left)
+    machine.connected = False
+    cluster.wait(PROVED_LONG + 1.0)
+    assert not cluster.state.instances[held.number].stopping

@@ -281,6 +281,18 @@ def test_an_end_after_a_restart_is_final() -> None:
     assert (cluster.phase("p"), len(cluster.assigned())) == ("finished", 1)
 
 
+def test_a_restart_before_the_first_run_ends_with_its_start() -> None:
+    """The slave need not report the start itself. The later end of the job is final."""
+    cluster = Cluster("a").with_processes(job("p"))
+    instance = InstanceId("p", cluster["p"].owner)
+    cluster.cut("a")
+    cluster.report("a", InstanceStatus(instance, InstanceState.BACKOFF))
+    cluster.restart("p")
+    cluster.report("a", InstanceStatus(instance, InstanceState.RUNNING, pid=9))
+    cluster.report("a", InstanceStatus(instance, InstanceState.EXITED, exit_code=0, run_time=1.0))
+    assert cluster.phase("p") == "finished"
+
+
 def test_the_oldest_terminal_processes_are_garbage_collected() -> None:
     """The newest `keep_ended` terminal processes stay in memory and journal.
 

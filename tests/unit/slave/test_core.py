@@ -447,6 +447,13 @@ def test_at_most_max_starting_instances_start_at_a_time() -> None:
     assert launched(one.step(SeenInGraph(InstanceId("n0", 1)))) == [InstanceId("n2", 1)]
 
 
+def test_the_wait_of_a_repeated_assignment_is_reported_at_once() -> None:
+    """The master repeats an assignment without a status, and would withdraw it later."""
+    one = Slave(max_starting=1)
+    assert states(one.step(nodes(2))) == []
+    assert states(one.step(nodes(2))) == [STATE.HELD]
+
+
 def test_an_instance_that_ends_before_it_is_ready_frees_its_slot() -> None:
     """An instance that is stopped because it is not ready in time frees its slot, too."""
     one = Slave(max_starting=1)

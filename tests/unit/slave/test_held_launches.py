@@ -65,7 +65,7 @@ def test_a_stop_of_a_held_job_goes_to_the_supervisor():
         (PLAIN, {}),
         (replace(JOB, ros=True, module="m", command=(), readiness=Readiness("graph")), {}),
         (replace(JOB, adoption=Adoption(7, 1, "boot")), {}),
-        (JOB, {"snapshot_hosts": ("a",)}),
+        (JOB, {"snapshots_from": 1}),
         (JOB, {"restored": True}),
     ],
     ids=["service", "node", "adopted", "snapshot", "restored"],

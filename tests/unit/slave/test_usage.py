@@ -85,14 +85,6 @@ def test_a_session_is_followed_from_its_start_to_its_end(table) -> None:
     assert (table.leaders, table.removed) == ([], [(40, 2.0), (41, 3.0)])
 
 
-def test_one_that_was_never_seen_running_counts_too(table) -> None:
-    """The process ended before the first look."""
-    watch = UsageWatch(table, lambda _: None)
-    watch.follow(told(InstanceState.STARTING))
-    watch.follow(told(InstanceState.FAILED, 40, cpu_time=0.1))
-    assert table.removed == [(40, 0.1)]
-
-
 def test_one_that_ended_before_this_slave_started_does_not_count(table) -> None:
     """The hours of CPU time of a recorded end are no present load."""
     UsageWatch(table, lambda _: None).follow(told(InstanceState.EXITED, cpu_time=3600.0))

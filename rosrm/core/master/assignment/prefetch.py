@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.state.hosts import Host
+from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import Instance
 from rosrm.model.durations import LONGEST
 from rosrm.model.values import InstanceState, InstanceStatus, Kind, ProcessSpec
@@ -51,10 +51,14 @@ def _ends_soon(state: MasterState, instance: Instance, now: float) -> bool:
     return expected is not None and expected <= _SHORT and now - instance.since < PROVED_LONG
 
 
-def waits_too_long(instance: Instance, now: float) -> bool:
-    """Return True if a prefetched assignment has waited longer than a short job runs."""
+def waits_too_long(state: MasterState, instance: Instance, now: float) -> bool:
+    """Return True if a prefetched assignment has waited longer than a short job runs.
+
+    On a host that is not up it may have started, and an order to stop would not arrive.
+    """
     return (
         instance.state is InstanceState.HELD
+        and state.hosts.condition_of(instance.host) is HostCondition.UP
         and instance.host.description.max_processes > 0  # otherwise it waits for other starts
         and not instance.stopping
         and now - instance.since >= PROVED_LONG
