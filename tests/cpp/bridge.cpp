@@ -347,6 +347,8 @@ void buffer_cover(
 
 int buffer_overlaps(InputBuffer * buffer, const char * input) {return buffer->overlaps(input);}
 
+int buffer_is_behind(InputBuffer * buffer, const char * input) {return buffer->is_behind(input);}
+
 int buffer_misses_one(InputBuffer * buffer, const char * input)
 {
   return buffer->misses_one(input);

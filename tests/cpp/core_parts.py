@@ -50,6 +50,9 @@ class CppInputBuffer:
     def overlaps(self, topic: str) -> bool:
         return bool(self._core.buffer_overlaps(self._handle, topic.encode()))
 
+    def is_behind(self, topic: str) -> bool:
+        return bool(self._core.buffer_is_behind(self._handle, topic.encode()))
+
     def misses_one(self, topic: str) -> bool:
         return bool(self._core.buffer_misses_one(self._handle, topic.encode()))
 

@@ -107,6 +107,21 @@ def hold(node: Any) -> None:
         node.hold()
 
 
+def withhold(node: Any) -> Callable[[], None]:
+    """Withhold the inputs of a shadow, until the returned function delivers them."""
+    is_python = isinstance(node, Node)
+    owner, name = (node._rosrm.entities, "_keep") if is_python else (node._core, "arrived")
+    deliver, held = getattr(owner, name), []
+    setattr(owner, name, lambda *what: held.append(what))
+
+    def release() -> None:
+        setattr(owner, name, deliver)
+        for what in held:
+            deliver(*what)
+
+    return release
+
+
 def buffered(node: Any) -> int:
     """Return the number of messages that a node has buffered."""
     return len(node._rosrm.entities.buffer) if isinstance(node, Node) else node.buffered

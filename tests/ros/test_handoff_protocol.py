@@ -37,6 +37,7 @@ from tests.ros.nodes import (
     Stage,
     buffered,
     pair_of,
+    withhold,
 )
 
 R, C = HandoffReport, StateConfig
@@ -292,6 +293,33 @@ def test_a_shadow_waits_until_it_is_matched_as_its_source_is(
         patch.setattr(entity, method, lambda: 0)
         shadowing(stage, pair, text)
     pair.conductor.wait(2, R.READY)
+
+
+def stalled(stage, pair):
+    """Stall a stream to the shadow after its first messages; return the function that ends it."""
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    stage.plain.create_timer(0.02, lambda: talker.publish(Int64(data=1)))
+    stage.spin_until(lambda: pair.sums and buffered(pair.second), "an input of both nodes")
+    return withhold(pair.second)
+
+
+def test_a_shadow_waits_until_a_stalled_input_has_arrived(stage, pair):
+    """Otherwise the successor would be stalled, although no message is lost."""
+    release = stalled(stage, pair)
+    pair.conductor.say(C.SHADOW)
+    text = "until the newest message on /add in the state has been here"
+    stage.spin_until(
+        lambda: any(text in one.message for one in pair.conductor.reports), f"a wait {text}"
+    )
+    assert R.READY not in pair.conductor.of(2)
+    release()
+    pair.conductor.wait(2, R.READY)
+
+
+def test_a_shadow_does_not_wait_for_ever_for_an_input_that_lags(stage, pair):
+    """On a slow link each mark may be here before the messages that it covers."""
+    stalled(stage, pair)
+    pair.conductor.prepare()
 
 
 def test_a_source_is_released_when_its_last_outputs_have_arrived(stage, pair, monkeypatch):

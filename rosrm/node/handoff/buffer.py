@@ -143,6 +143,13 @@ class InputBuffer:
         """Return True if a received message is covered too; after that message none is missing."""
         return self._track(topic).overlap
 
+    def is_behind(self, topic: str) -> bool:
+        """Return True if the one publisher's newest covered message has not arrived here."""
+        track = self._track(topic)
+        if track.mixed or track.newest is None:
+            return False
+        return track.last is None or track.last.stamp < track.newest
+
     def misses_one(self, topic: str) -> bool:
         """Return True if a sent message has not arrived and no state covers it."""
         track = self._track(topic)

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
 
 #: Seconds without a message after which an input counts as idle.
 _IDLE: Final = 1.0
+#: Seconds, from the matching of all peers, for which an input must not be behind the state. A
+#: reliable reader that misses a message receives nothing until the next heartbeat of the writer,
+#: every 3 s by default. The time is limited, because on a slow link an input may always be behind.
+_BEHIND: Final = 5.0
 #: Seconds without a part or mark after which an ended source counts as drained.
 _QUIET: Final = 0.2
 #: Seconds for which all readers have to be matched. A reader discovers a writer later than the
@@ -223,6 +227,8 @@ class Destination:
 
     def _look(self) -> None:
         with self._entities.turn:
+            if not self._ended and not self._was_ready:
+                self._entities.catch_up()  # messages that wait in a reader have arrived, too
             if not self._ended:
                 self._review()
 
@@ -290,8 +296,9 @@ class Destination:
         if now - self._matched_at < _MATCHED:
             return "a moment: its peers may not know it yet"
         for covered in self._cut.mark.inputs:
-            if not self._follows(covered.topic, now):
-                return f"until a message on {covered.topic} has been here and in the state"
+            missing = self._missing_input(covered.topic, now)
+            if missing:
+                return missing
         lossy = self._entities.input_with_gap()
         if lossy:
             return f"until the state covers a message on {lossy} that did not come here"
@@ -322,12 +329,21 @@ class Destination:
             return f"for the state on {', '.join(missing)}"
         return f"for the first state, marked on {self._mark_topic}"
 
-    def _follows(self, topic: str, now: float) -> bool:
-        """Return True if each message of an input is in the buffer or covered by the state."""
+    def _missing_input(self, topic: str, now: float) -> str:
+        """Return the condition of an input that this node waits for; "" if there is none.
+
+        Each message must be in the buffer or covered by the state, and the newest covered one must
+        have arrived.
+        """
         buffer = self._entities.buffer
-        if all(one.key != topic for one in self._entities.inputs) or buffer.overlaps(topic):
-            return True
-        return buffer.is_idle(topic, now, self._matched_at, _IDLE)
+        is_own = any(one.key == topic for one in self._entities.inputs)
+        if not is_own or buffer.is_idle(topic, now, self._matched_at, _IDLE):
+            return ""
+        if not buffer.overlaps(topic):
+            return f"until a message on {topic} has been here and in the state"
+        if buffer.is_behind(topic) and now - self._matched_at < _BEHIND:
+            return f"until the newest message on {topic} in the state has been here"
+        return ""
 
     # --- the end ---------------------------------------------------------------------------
 

@@ -13,6 +13,10 @@ namespace
 
 /// Seconds without a message after which an input counts as idle.
 constexpr double kIdle = 1.0;
+/// Seconds, from the matching of all peers, for which an input must not be behind the state. A
+/// reliable reader that misses a message receives nothing until the next heartbeat of the writer,
+/// every 3 s by default. The time is limited, because on a slow link an input may always be behind.
+constexpr double kBehind = 5.0;
 /// Seconds without a part or mark after which an ended source counts as drained.
 constexpr double kQuiet = 0.2;
 /// Seconds for which all readers have to be matched.
@@ -82,7 +86,7 @@ void Destination::open(const StateConfig & config)
     follow_part(*part);
   }
   if (!ended_) {
-    alarm_ = entities_.alarms.start(kReview, [this] {review();});
+    alarm_ = entities_.alarms.start(kReview, [this] {look();});
     review();
   }
 }
@@ -216,6 +220,14 @@ std::string Destination::fault_of(const StateMark & mark) const
 
 // --- following ---------------------------------------------------------------------------------
 
+void Destination::look()
+{
+  if (!ended_ && !was_ready_) {
+    entities_.catch_up();  // messages that wait in a reader have arrived, too
+  }
+  review();
+}
+
 /// Restore the newest state, if there is a new one, then check the next step.
 void Destination::go_on()
 {
@@ -308,8 +320,9 @@ std::string Destination::still_missing()
     return "a moment: its peers may not know it yet";
   }
   for (const auto & input : cut_->mark.inputs) {
-    if (!follows(input.topic, now)) {
-      return "until a message on " + input.topic + " has been here and in the state";
+    const std::string missing_here = missing_input(input.topic, now);
+    if (!missing_here.empty()) {
+      return missing_here;
     }
   }
   const std::string lossy = entities_.input_with_gap();
@@ -354,15 +367,25 @@ std::string Destination::missing_state() const
   return "for the state on " + topics;
 }
 
-/// Return true if each message of an input is in the buffer or covered by the state.
-bool Destination::follows(const std::string & key, double now)
+/// Return the condition of an input that this node waits for; "" if there is none. Each message must
+/// be in the buffer or covered by the state, and the newest covered one must have arrived.
+std::string Destination::missing_input(const std::string & key, double now)
 {
   const bool is_own = std::any_of(
     entities_.inputs.begin(), entities_.inputs.end(), [&key](const auto & input) {
       return input->key == key;
     });
   InputBuffer & buffer = entities_.buffer;
-  return !is_own || buffer.overlaps(key) || buffer.is_idle(key, now, *matched_at_, kIdle);
+  if (!is_own || buffer.is_idle(key, now, *matched_at_, kIdle)) {
+    return "";
+  }
+  if (!buffer.overlaps(key)) {
+    return "until a message on " + key + " has been here and in the state";
+  }
+  if (buffer.is_behind(key) && now - *matched_at_ < kBehind) {
+    return "until the newest message on " + key + " in the state has been here";
+  }
+  return "";
 }
 
 // --- the end -----------------------------------------------------------------------------------

@@ -119,6 +119,12 @@ bool InputBuffer::overlaps(const std::string & input)
   return track(input).overlap;
 }
 
+bool InputBuffer::is_behind(const std::string & input)
+{
+  const Track & one = track(input);
+  return !one.mixed && one.newest && (!one.last || one.last->stamp < *one.newest);
+}
+
 bool InputBuffer::misses_one(const std::string & input)
 {
   const Track & one = track(input);

@@ -54,6 +54,7 @@ private:
   bool catch_up();
   void take_mark(const Bytes & data);
   std::string fault_of(const StateMark & mark) const;
+  void look();
   void go_on();
   bool restore(Cut cut);
   void review();
@@ -62,7 +63,7 @@ private:
   std::string still_missing();
   std::string missing_peers() const;
   std::string missing_state() const;
-  bool follows(const std::string & input, double now);
+  std::string missing_input(const std::string & input, double now);
   void take_over_when_quiet();
   void activate_if_complete();
   void activate();

@@ -59,6 +59,9 @@ public:
   /// Return true if a received message is covered too; after that message none is missing.
   bool overlaps(const std::string & input);
 
+  /// Return true if the one publisher's newest covered message has not arrived here.
+  bool is_behind(const std::string & input);
+
   /// Return true if a sent message has not arrived, and no state covers it.
   bool misses_one(const std::string & input);
 

@@ -146,6 +146,34 @@ def test_an_input_overlaps_once_a_message_was_here_and_in_the_state(make):
     assert buffer.overlaps(B)
 
 
+def test_an_input_is_behind_until_the_newest_covered_message_arrives(make):
+    """After a lost message a reliable reader may receive nothing more for seconds."""
+    buffer = make(10, ROOM, 0.0)
+    assert not buffer.is_behind(A)
+    buffer.cover(A, [1], single=True, now=0.0)
+    assert buffer.is_behind(A)
+    buffer.add(A, Sent(1), None, 0.0)
+    assert not buffer.is_behind(A)
+    buffer.cover(A, [1, 2, 3], single=True, now=0.0)
+    assert buffer.overlaps(A)
+    assert buffer.is_behind(A)
+    buffer.add(A, Sent(2), None, 0.0)
+    assert buffer.is_behind(A)
+    buffer.add(A, Sent(4), None, 0.0)
+    assert not buffer.is_behind(A)
+
+
+def test_an_input_of_several_publishers_is_not_behind(make):
+    """Their clocks cannot be compared, nor can that of a publisher that moved to another clock."""
+    buffer = filled(make, (A, 1), (B, 1000))
+    buffer.cover(A, [1, 1000], single=False, now=0.0)
+    assert not buffer.is_behind(A)
+    buffer.cover(B, [1000, 1001], single=True, now=0.0)
+    assert buffer.is_behind(B)
+    buffer.add(B, Sent(3), None, 0.0)
+    assert not buffer.is_behind(B)
+
+
 def test_an_input_is_idle_when_nothing_waits_and_nothing_came_for_a_while(make):
     """The time counts from the beginning of the buffer."""
     buffer = make(10, ROOM, 100.0)
