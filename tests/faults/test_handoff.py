@@ -18,7 +18,7 @@ pytestmark = pytest.mark.timeout(180)
 #: In order. "says X" is a message of the master; the others are reported by a node, or by the slave
 #: of the "source" or the "destination".
 MOMENTS = [
-    "destination starting", "source policy", "says SHADOW", "SHADOWING", "ATTACHED", "READY",
+    "destination running", "source policy", "says SHADOW", "SHADOWING", "ATTACHED", "READY",
     "says SWITCH", "SWITCHING", "SILENT", "RELEASED", "ACTIVE", "destination policy",
     "source stopping", "says DONE",
 ]  # fmt: skip
@@ -64,10 +64,10 @@ def test_the_master_is_killed(scene, moment):
 @pytest.mark.parametrize(
     ("whose", "moment"),
     [
-        ("source", "destination starting"), ("source", "source policy"), ("source", "says SHADOW"),
+        ("source", "destination running"), ("source", "source policy"), ("source", "says SHADOW"),
         ("source", "says SWITCH"), ("source", "SILENT"), ("source", "RELEASED"),
         ("source", "ACTIVE"), ("source", "source stopping"), ("source", "says DONE"),
-        ("destination", "destination starting"), ("destination", "says SHADOW"),
+        ("destination", "destination running"), ("destination", "says SHADOW"),
         ("destination", "READY"), ("destination", "says SWITCH"), ("destination", "SILENT"),
         ("destination", "ACTIVE"), ("destination", "source stopping"),
         ("destination", "says DONE"),

@@ -31,6 +31,8 @@ class Loader:
 
     def __init__(self, participant: Participant, domain: int) -> None:
         self.participant = participant
+        # A container answers a new client only once it has discovered it.
+        self.clients: dict[str, Any] = {}
         arguments = ["--ros-args", "-r", "__ns:=/arm"]
         self.process = subprocess.Popen(
             [sys.executable, "-m", "rosrm.cli", "container", *arguments], cwd=ROOT,
@@ -40,7 +42,10 @@ class Loader:
     def ask(self, kind: str, service: str, **fields: Any) -> Any:
         """Return the answer of the container to a request."""
         of = getattr(srv, kind)
-        client = self.participant.node.create_client(of, f"/arm/container/_container/{service}")
+        if service not in self.clients:
+            path = f"/arm/container/_container/{service}"
+            self.clients[service] = self.participant.node.create_client(of, path)
+        client = self.clients[service]
         assert client.wait_for_service(PATIENCE), f"{service} is not offered"
         future = client.call_async(of.Request(**fields))
         return answer_to(self.participant, future, time.monotonic() + PATIENCE)

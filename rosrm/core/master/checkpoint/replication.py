@@ -138,6 +138,8 @@ def review(state: MasterState, now: float) -> None:
         known.dropped_at.clear()
     share = min(1.0, (now - known.reviewed_at) / _LOOK_EVERY)
     known.reviewed_at = now
+    if (state.hosts.condition == HostCondition.EXPECTED).any():
+        return  # such a host may have a replica; slaves continue with the hosts chosen before
     if not known.waiting:
         known.waiting = names[::-1]
     for _ in range(math.ceil(share * len(names))):
