@@ -9,7 +9,6 @@ that address, and the real participant receives the reply (docs/decisions/0009).
 
 from __future__ import annotations
 
-import fcntl
 import os
 import socket
 import struct
@@ -17,6 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Final
 
 from rosrm.ros.graph_remains import open_sockets
+from rosrm.runtime.addresses import reachable_addresses
 
 #: DDSI-RTPS 2.3, 9.6.1 and 9.6.2: group and ports of discovery.
 _GROUP: Final = "239.255.0.1"
@@ -26,8 +26,6 @@ _FIRST_UNICAST: Final = 10
 #: With LOCALHOST, rmw_fastrtps sends announcements to the ports of the first 32 participants.
 _MOST_ON_THIS_MACHINE: Final = 32
 _LOOPBACK: Final = "127.0.0.1"
-#: From linux/sockios.h: the IPv4 address of an interface.
-_SIOCGIFADDR: Final = 0x8915
 
 #: Seconds after which the peers forget the announced participant.
 _LEASE: Final = 1
@@ -74,7 +72,7 @@ def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
 
 
 def _send_to_group(sender: socket.socket, group: tuple[str, int], ports: Sequence[int]) -> None:
-    for address in _own_addresses(sender):
+    for address in reachable_addresses():
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(address))
         try:
             sender.sendto(announcement(address, ports), group)
@@ -117,17 +115,3 @@ def _bound_ports() -> Iterator[int]:
         with socket.socket(fileno=copy) as one:
             if one.family == socket.AF_INET and one.type == socket.SOCK_DGRAM:
                 yield one.getsockname()[1]
-
-
-def _own_addresses(any_socket: socket.socket) -> list[str]:
-    """Return the IPv4 address of each interface; the loopback address only if there is no other."""
-    found = []
-    for _, name in socket.if_nameindex():
-        request = struct.pack("16s24x", name.encode())
-        try:
-            answer = fcntl.ioctl(any_socket, _SIOCGIFADDR, request)
-        except OSError:  # no IPv4 address
-            continue
-        found.append(socket.inet_ntoa(answer[20:24]))
-    others = [address for address in found if not address.startswith("127.")]
-    return others or [_LOOPBACK]

@@ -7,6 +7,7 @@ private_files.py   owner, mode and links of directories and files
 atomic_file.py     replacement of a whole file, or of nothing
 cgroups.py         control groups: mounts, the own group, delegation
 disk_space.py      free space on the disk of a directory
+addresses.py       IPv4 addresses of the network interfaces
 settings_check.py  check of a settings file, in a process of its own
 parent_death.py    end of a process with its parent
 oom_score.py       protection of an agent from the OOM killer

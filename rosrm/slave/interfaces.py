@@ -1,37 +1,22 @@
-"""Network interfaces of this machine: addresses, speed and counters, read from the kernel."""
+"""Network interfaces of this machine: their speed, their counters and the one in use."""
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import math
 import socket
-import struct
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
-from rosrm.model.links import INTERFACES, MOST_ADDRESSES, Interface
+from rosrm.model.links import INTERFACES, Interface
 from rosrm.model.ros_settings import RosSettings
+from rosrm.runtime.addresses import addresses
 
 _CLASSES: Final = Path("/sys/class/net")
 _BYTES_PER_MEGABIT: Final = 1e6 / 8
-#: ioctl that returns the IPv4 address of an interface.
-_SIOCGIFADDR: Final = 0x8915
 _LOOPBACK: Final = "127.0.0.1"
-_REQUEST: Final = struct.Struct("256s")
-
-
-def addresses() -> dict[str, str]:
-    """Return the IPv4 address of each interface that has one."""
-    found = {}
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        for _, name in socket.if_nameindex():
-            with contextlib.suppress(OSError):  # it has no address
-                answer = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, _REQUEST.pack(name.encode()))
-                found[name] = socket.inet_ntoa(answer[20:24])
-    return found
 
 
 def own_address(settings: RosSettings) -> str:
@@ -40,13 +25,6 @@ def own_address(settings: RosSettings) -> str:
     if interface:
         return addresses().get(interface, interface)
     return _LOOPBACK if settings.is_local() else ""
-
-
-def reachable_addresses() -> tuple[str, ...]:
-    """Return the IPv4 addresses at which other hosts may reach this one; loopback if none can."""
-    found = dict.fromkeys(addresses().values())
-    outer = [one for one in found if not one.startswith("127.")]
-    return tuple(outer or found)[:MOST_ADDRESSES]
 
 
 def interface_towards(address: str) -> str:

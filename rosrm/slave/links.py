@@ -22,9 +22,16 @@ from typing import Final
 from rosrm.config.settings import LinkSettings
 from rosrm.keys import link_packets
 from rosrm.keys.link_packets import NONCE_BYTES, PACKET_BYTES, Packet
-from rosrm.model.links import LONGEST_ROUND_TRIP, MEASURE_SECONDS, LinkPeer, LinkReport
+from rosrm.model.links import (
+    LONGEST_ROUND_TRIP,
+    MEASURE_SECONDS,
+    MOST_ADDRESSES,
+    LinkPeer,
+    LinkReport,
+)
 from rosrm.model.orders import MeasureLinks
-from rosrm.slave.interfaces import Traffic, interface_towards, reachable_addresses
+from rosrm.runtime.addresses import reachable_addresses
+from rosrm.slave.interfaces import Traffic, interface_towards
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -200,7 +207,7 @@ class LinkProber:
             if number is not None and towards:
                 peers[peer.host_id] = (number, seconds)
         port = self._socket.getsockname()[1] if self._socket is not None else 0
-        addresses = (self._only,) if self._only else reachable_addresses()
+        addresses = (self._only,) if self._only else reachable_addresses()[:MOST_ADDRESSES]
         measurement.done(
             LinkReport(
                 addresses, port, self._settings.limit, self._traffic.read(), peers, self._flows()
