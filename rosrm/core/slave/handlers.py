@@ -79,12 +79,12 @@ def _assigned(state: SlaveState, event: events.AssignmentsReceived, now: float) 
         state.waiting[instance] = assignment
         state.hold(instance, _waiting(assignment))
     launches = _start_waiting(state, now)
-    known = [one.instance for one in event.assignments]
-    held = [one for one in known if state.held[one].status.state is InstanceState.HELD]
+    known = [state.held[one.instance] for one in event.assignments]
+    held = [one for one in known if one.status.state is InstanceState.HELD]
     why = state.why_wait() if held else ""
     for one in held:
-        state.held[one].status = replace(state.held[one].status, message=why)
-        state.unreported.setdefault(one, now + REPORT_WAIT)
+        one.status = replace(one.status, message=why)
+        state.unreported.setdefault(one.status.instance, now + REPORT_WAIT)
     reports = [commands.Report(tuple(refusals))] if refusals else []
     return [*launches, *reports, *_report_waits(state, now)]
 
@@ -168,9 +168,11 @@ def _launch_held(state: SlaveState) -> _Commands:
 def _is_plain_job(assignment: Assignment) -> bool:
     """Return True if nothing has to be fetched, awaited or restored to start an instance."""
     spec = assignment.spec
-    plain = spec.kind is Kind.JOB and not (spec.awaits_graph or spec.artifacts)
-    plain = plain and not spec.container.image and spec.adoption == NO_ADOPTION
-    return plain and not assignment.has_snapshots and not assignment.restored
+    needs_slave = (
+        spec.awaits_graph, spec.artifacts, spec.container.image, spec.adoption != NO_ADOPTION,
+        assignment.has_snapshots, assignment.restored,
+    )  # fmt: skip
+    return spec.kind is Kind.JOB and not any(needs_slave)
 
 
 def _refuse_late(state: SlaveState, now: float) -> _Commands:

@@ -52,9 +52,11 @@ class MasterSearch:
         A slave without a master registers with the first one that answers. So if all hosts of the
         journal wait here for their registration, no other master has one of them.
         """
+        if self.found is not None:
+            return True
         events = self._endpoint.events
-        if self.found is not None or not 0 < len(hosts) <= len(events):
-            return self.found is not None
+        if not hosts or len(events) < len(hosts):
+            return False
         registering = {
             event.description.name for event in events if isinstance(event, happened.HostRegistered)
         }
