@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
+import signal
+import subprocess
+import sys
 
 import pytest
 from rcl_interfaces.msg import ParameterDescriptor
@@ -15,11 +19,21 @@ from rosrm_criu.node.graph_departure import (
     Departure,
     await_peers,
     departure_of,
+    have_acknowledged,
     others_of,
     peers_of,
     sees_again,
 )
 from tests.ros.nodes import RELIABLE
+
+READER = """\
+import rclpy
+from std_msgs.msg import Int64
+rclpy.init()
+node = rclpy.create_node("reader")
+node.create_subscription(Int64, "out", lambda _: None, 10)
+rclpy.spin(node)
+"""
 
 
 def again(stage, departure: Departure, name: str = "again", **named) -> Node:
@@ -132,6 +146,26 @@ def test_missing_peers_are_named_when_patience_ends(node) -> None:
     node.create_subscription(Int64, "in", lambda _: None, RELIABLE)
     before = {"readers of /out": 2, "writers of /in": 0, "a server of /gone": 1}
     assert await_peers(node, before, 0.02) == ("readers of /out: 0 of 2",)
+
+
+def test_a_sample_is_missed_until_its_reader_acknowledges(stage, node) -> None:
+    """The node has a sample that nobody has read while its reader is stopped, and then no more."""
+    output = node.create_publisher(Int64, "out", RELIABLE)
+    domain = str(node.context.get_domain_id())
+    environment = {**os.environ, "ROS_DOMAIN_ID": domain}
+    reader = subprocess.Popen([sys.executable, "-c", READER], env=environment)
+    try:
+        stage.spin_until(lambda: output.get_subscription_count() == 1, "the reader")
+        stage.spin_until(lambda: have_acknowledged(node), "no sample that is missed")
+        reader.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, reader.pid, os.WSTOPPED)
+        output.publish(Int64(data=1))
+        assert not have_acknowledged(node)
+        reader.send_signal(signal.SIGCONT)
+        stage.spin_until(lambda: have_acknowledged(node), "the acknowledgement")
+    finally:
+        reader.kill()
+        reader.wait()
 
 
 def test_ends_of_others_are_counted(stage, node) -> None:

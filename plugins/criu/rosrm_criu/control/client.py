@@ -27,7 +27,7 @@ from rosrm_criu.control.messages import (
 )
 
 #: Seconds between two reads of a status file; the standard library cannot wait for a file change.
-_LOOK: Final = 0.005
+_LOOK: Final = 0.002
 
 
 #: Made by an administrator or a service manager on all hosts, if at all; see `control_roots`.
@@ -161,7 +161,7 @@ def ask_resume(directory: Path, pid: int | None, request_id: str) -> None:
 
     Args:
         directory: its control directory; on another host the path is the same.
-        pid: its process, which gets a signal; None: the node polls every 10 ms while away.
+        pid: its process, which gets a signal; None: the node polls every 2 ms while away.
         request_id: the one of the request to leave.
 
     Raises:

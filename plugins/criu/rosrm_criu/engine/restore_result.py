@@ -21,7 +21,7 @@ from rosrm_criu.engine import paths
 FILE: Final = "hold.json"
 
 #: Seconds between two reads of the file; the standard library cannot wait for a file.
-_LOOK: Final = 0.005
+_LOOK: Final = 0.002
 
 
 @dataclass(frozen=True)

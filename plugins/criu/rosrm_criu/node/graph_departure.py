@@ -127,6 +127,11 @@ def await_readers(node: Any, patience: float) -> None:
         one.wait_for_all_acked(Duration(seconds=left))
 
 
+def have_acknowledged(node: Any) -> bool:
+    """Return True if all reliable readers of a node have all samples."""
+    return all(one.wait_for_all_acked(Duration()) for one in node.publishers)
+
+
 def others_of(node: Any) -> Counter[tuple[str, str]]:
     """Return how many endpoints of other nodes the graph has on a node's topics and clients."""
     own = Counter(

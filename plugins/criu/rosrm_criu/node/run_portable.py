@@ -23,19 +23,21 @@ from rosrm.ros import fast_dds_relocation
 from rosrm.ros.graph_remains import what_is_left
 from rosrm_criu.control.listener import Listener
 from rosrm_criu.control.messages import SIGNAL, VARIABLE, Request, State, Status, Want
-from rosrm_criu.node.graph_departure import Departure, sees_again
+from rosrm_criu.node.graph_departure import Departure, have_acknowledged, sees_again
 from rosrm_criu.node.portable import PortableNode
 
 #: Seconds between two reads of the request file: while the node runs, and while it is away. The
 #: first also wakes an idle node; a busy one notices the signal after its callback.
 _LOOK: Final = 0.25
-_LOOK_AWAY: Final = 0.01
+_LOOK_AWAY: Final = 0.002
 #: Signals that end a process; rclpy handles them while there is a context.
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 #: Seconds for the neighbours to announce themselves to a participant that can hear them.
 _GREETED: Final = 0.3
 #: Most attempts to enter. After that, a missing peer may have left, and others may see the node.
 _ENTRIES: Final = 4
+#: Seconds in which callbacks run on until all readers have acknowledged: over two heartbeats.
+_ACKNOWLEDGED: Final = 0.25
 #: Seconds for pending work of callbacks (threads, coroutines) to end.
 _REST: Final = 5.0
 
@@ -188,6 +190,7 @@ class _Run:
         listener.report(Status(State.LEAVING, request.id))
         try:
             fast_dds_relocation.check()
+            self._run_until_acknowledged()
             self._come_to_rest()
         except PortableError as error:
             return None, str(error)
@@ -197,6 +200,15 @@ class _Run:
             seconds = {"leave": round(time.monotonic() - began, 6)}
             listener.report(Status(State.LEFT, request.id, seconds=seconds))
         return departure, fault
+
+    def _run_until_acknowledged(self) -> None:
+        """Run callbacks until no reader misses a sample, because `leave` waits for the readers.
+
+        They acknowledge only after a heartbeat (0.1 s), in which the node would already be silent.
+        """
+        deadline = time.monotonic() + _ACKNOWLEDGED
+        while not have_acknowledged(self._node) and time.monotonic() < deadline:
+            self._executor.spin_once(timeout_sec=0.002)
 
     def _come_to_rest(self) -> None:
         """Wait for the end of pending callbacks, so that the departure interrupts none."""
