@@ -16,8 +16,8 @@ from rosrm.wording import by_reason, listed
 
 #: In place of the descriptor of a control group.
 NO_GROUP: Final = -1
-#: Attempts to start a process in its group.
-_ATTEMPTS: Final = 2
+#: Attempts to start a process in its group: the first one may find a prepared group removed.
+_ATTEMPTS: Final = 3
 _POLICIES: Final = {"fifo": os.SCHED_FIFO, "rr": os.SCHED_RR}
 
 #: Starts the process of an instance, given its group and its scheduling as in `spawn.spawn`.
@@ -74,6 +74,10 @@ class Confinement:
             own.update(_nice_fault(pid, limits))
         enforced = tuple(name for name in wanted if name not in faults and name not in own)
         return Confined(pid, enforced, by_reason(own.items()))
+
+    def prepare(self, key: Key, limits: LimitRule) -> None:
+        """Make the group of an instance before its start."""
+        self.groups.prepare(key, limits, realtime=bool(limits.policy))
 
     def change(self, key: Key, former: LimitRule, limits: LimitRule) -> tuple[str, ...]:
         """Change the limits of an instance that runs; return the names of those that hold.

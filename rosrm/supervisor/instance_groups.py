@@ -51,6 +51,7 @@ class InstanceGroups:
         self._made: dict[Key, tuple[Tree, ...]] = {}
         self._unset: dict[Key, dict[str, Any]] = {}  # limits that could not be set at the start
         self._kills_before: dict[Key, int] = {}
+        self._prepared: dict[Key, tuple[LimitRule, dict[str, str]]] = {}  # limits and faults
         self._emptied: dict[str, float] = {}
         self._homes: dict[str, int] = {}  # group to descriptor of its `tasks` file, for the return
         self._unfinished: dict[Key, set[Tree]] = {}  # groups that some processes did not enter
@@ -76,6 +77,10 @@ class InstanceGroups:
                 if other.startswith(PREFIX):
                     remove_empty(os.path.join(base, other))
 
+    def prepare(self, key: Key, limits: LimitRule, *, realtime: bool) -> None:
+        """Make the group of an instance ahead of its start, for the next `make`."""
+        self._prepared[key] = limits, self.make(key, limits, realtime=realtime)
+
     def make(self, key: Key, limits: LimitRule, *, realtime: bool) -> dict[str, str]:
         """Make the group of an instance with its limits; return the faults by limit.
 
@@ -83,7 +88,10 @@ class InstanceGroups:
             realtime: leave out groups of the controller cpu of version 1, which by default allow
                 no real-time scheduling, and whose limits have no effect on it.
         """
-        faults: dict[str, str] = {}
+        made_for, faults = self._prepared.pop(key, (None, {}))
+        if made_for == limits:
+            return faults
+        faults = {}
         made, is_new = [], True
         for tree in self.trees:
             if not self._needs(tree, limits, realtime=realtime):
@@ -234,6 +242,7 @@ class InstanceGroups:
 
     def remove(self, key: Key, now: float) -> None:
         """Remove the group of an instance that has ended, with all that may be left in it."""
+        self._prepared.pop(key, None)
         self._kills_before.pop(key, None)
         self._unset.pop(key, None)
         for tree in (*self._made.pop(key, ()), *self._unfinished.pop(key, ())):

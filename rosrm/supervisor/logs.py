@@ -70,9 +70,15 @@ class LogKeeper:
         self._state = state
         self._logs: dict[Key, _Log] = {}
         self._opened: dict[Key, int] = {}
+        self._prepared: dict[Key, int] = {}  # descriptors of logs that were opened ahead
         self._due: float | None = None
         self._folder = LogFolder(state)
         self._unchecked = limits.keep_bytes  # bytes that may lie there from earlier
+
+    def prepare(self, instance: Key, known: Collection[Key]) -> None:
+        """Open the log of an instance ahead of its start, for the next `open`."""
+        with contextlib.suppress(OSError):  # `open` tries again, and reports the fault
+            self._prepared[instance] = self.open(instance, known)
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
         """Open the log of a starting instance; make room, but keep logs of `known` instances.
@@ -80,6 +86,11 @@ class LogKeeper:
         Raises:
             OSError: the log cannot be opened. An old log that cannot be removed prevents no start.
         """
+        prepared = self._prepared.pop(instance, None)
+        if prepared is not None:
+            if os.fstat(prepared).st_nlink:
+                return prepared
+            os.close(prepared)  # a user has removed the file
         path = paths.log_file(self._state, *instance)
         log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
         self._opened[instance] = os.fstat(log).st_size
@@ -119,8 +130,15 @@ class LogKeeper:
         self._due = now + BUSY
 
     def release(self, instance: Key) -> None:
-        """Check the log of an ended instance a last time and stop watching it."""
-        self._opened.pop(instance, None)
+        """Check the log of an ended instance a last time and stop watching it.
+
+        Remove the log that was opened ahead for an instance that never started.
+        """
+        opened, prepared = self._opened.pop(instance, 0), self._prepared.pop(instance, None)
+        if prepared is not None:
+            os.close(prepared)
+            if not opened:
+                _unlink(paths.log_file(self._state, *instance))
         log = self._logs.pop(instance, None)
         if log is not None:
             self._unchecked += log.look(self.limits)
@@ -147,7 +165,7 @@ class LogKeeper:
             return
         self._unchecked = 0
         try:
-            self._folder.remove_excess(self._logs, self.limits.keep_bytes)
+            self._folder.remove_excess([*self._logs, *self._prepared], self.limits.keep_bytes)
         except OSError as error:
             own_log.write(f"an old log cannot be removed: {error}")
 

@@ -86,6 +86,8 @@ class Server:
         self._environments: dict[str, dict[str, str]] = {}
         self._notes: list[str] = []
         self._spawns: deque[Key] = deque()
+        self._prepared: Key | None = None
+        self._ended: list[Key] = []  # with control groups that are still to be removed
         self._unsent: list[bytes] = []
         self._first_starts: dict[Key, messages.Status] = {}  # unsent statuses before the first run
         self._client: Connection | None = None
@@ -125,10 +127,12 @@ class Server:
         self._trees.look(now)
         self._groups.look(now)
         self._spawn_some()
+        self._remove_groups()
         if self._record.is_large():
             self._rewrite_record()
         self._record.flush()
         self._report()
+        self._prepare_held()
         if self._served and self._client is None and self._core.idle:
             self._leaving = True
 
@@ -180,7 +184,10 @@ class Server:
             self._logs.release(key)
         if not instance.pid and instance.phase != STOPPING:
             self._trees.release(key)
-            self._groups.remove(key, time.monotonic())
+            if instance.ended:
+                self._ended.append(key)
+            elif instance.started:  # otherwise its groups may have been made ahead
+                self._groups.remove(key, time.monotonic())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
         status = messages.Status.of(instance)
         # The slave has ordered the start, and most spawns are in the same round. So `starting` is
@@ -205,6 +212,25 @@ class Server:
             self._send(self._client, unsent)
 
     # --- spawning -----------------------------------------------------------------------------
+
+    def _prepare_held(self) -> None:
+        """Open the log and make the control groups of the next held instance before its start.
+
+        A fault is ignored, because the start tries again.
+        """
+        key = self._core.next_held
+        launch = self._launches.get(key) if key is not None else None
+        if key is None or key == self._prepared or launch is None:
+            return
+        self._prepared = key
+        self._logs.prepare(key, self._core.instances)
+        self._confinement.prepare(key, launch.limits)
+
+    def _remove_groups(self) -> None:
+        """Remove the control groups of ended instances; held instances have started before."""
+        for key in self._ended:
+            self._groups.remove(key, time.monotonic())
+        self._ended.clear()
 
     def _spawn_some(self) -> None:
         if not self._spawns:

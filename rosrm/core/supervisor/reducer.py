@@ -132,6 +132,11 @@ class SupervisorState:
         return min(self._timed.values(), default=None)
 
     @property
+    def next_held(self) -> Key | None:
+        """Return the held instance that starts first; None: none is held."""
+        return next(iter(self._held), None)
+
+    @property
     def idle(self) -> bool:
         """Return True if no instance runs, and none will without an order."""
         return all(instance.ended for instance in self.instances.values())

@@ -6,6 +6,7 @@ import pytest
 
 from rosrm.core.supervisor.events import StopOrdered
 from rosrm.model.values import InstanceState
+from tests.waiting import wait_until
 
 from .conftest import kill
 
@@ -42,9 +43,12 @@ def test_a_held_process_starts_after_a_take_over(host, client):
     assert host.log("next").read_text() == "ran\n"
 
 
-def test_a_held_process_that_was_stopped_never_starts(host, client):
-    """The final status shows a run time of 0."""
+@pytest.mark.parametrize("replaced", [False, True], ids=["same supervisor", "next supervisor"])
+def test_a_held_process_that_was_stopped_never_starts(host, client, replaced):
+    """The final status shows a run time of 0, and the log that was made ahead is removed."""
     pid = held(host, client)
+    wait_until(host.log("next").exists, "the log of the held process")
+    client = host.replace_supervisor(client) if replaced else client
     client.send(StopOrdered(("next", 1)))
     assert host.ended(client, "next").run_time == 0.0
     kill(pid)

@@ -10,6 +10,7 @@ from threading import Event
 
 import pytest
 
+from rosrm.core.supervisor.events import StopOrdered
 from rosrm.core.supervisor.rules import LimitRule
 from rosrm.model.values import InstanceState, Limits, RestartPolicy
 from rosrm.supervisor import group_trees
@@ -204,6 +205,20 @@ def test_a_stop_ends_a_daemon_that_hides(host, client) -> None:
     os.kill(leader, signal.SIGKILL)
     assert host.ended(client, "parent").exit_signal == signal.SIGKILL
     wait_gone(daemon)
+    wait_removed(client)
+
+
+@pytest.mark.parametrize("replaced", [False, True], ids=["same supervisor", "next supervisor"])
+def test_a_held_instance_that_is_stopped_leaves_no_group(host, client, replaced: bool) -> None:
+    """Its groups are made ahead, and the next supervisor finds them."""
+    pid = host.sleeper(client, "first")
+    client.start([host.order("next", "true", slots=1, limits=LimitRule(memory=30 * MB))])
+    host.wait(client, "next", InstanceState.HELD)
+    client = host.replace_supervisor(client) if replaced else client
+    client.send(StopOrdered(("next", 1)))
+    host.ended(client, "next")
+    kill(pid)
+    host.ended(client, "first")
     wait_removed(client)
 
 

@@ -321,6 +321,21 @@ def test_kills_of_an_earlier_run_are_not_reported(files) -> None:
     assert groups.out_of_memory(KEY) == (5e8, 0.0)
 
 
+def test_a_group_that_was_made_ahead_gets_changed_limits(tmp_path: Path) -> None:
+    """A held instance may be amended before its start; unchanged limits are written only once."""
+    top = tmp_path / "top"
+    top.mkdir()
+    groups = InstanceGroups([Tree(2, str(top), str(tmp_path), ("memory",))])
+    group = top / "camera.1"
+    groups.prepare(KEY, LimitRule(), realtime=False)
+    (group / "memory.max").touch()
+    assert groups.make(KEY, LimitRule(), realtime=False) == {}
+    assert (group / "memory.max").read_text() == ""
+    groups.prepare(KEY, LimitRule(), realtime=False)
+    groups.make(KEY, LimitRule(memory=5e8), realtime=False)
+    assert (group / "memory.max").read_text() == "500000000"
+
+
 def test_an_unlimited_niceness_is_not_missing(tmp_path: Path, monkeypatch) -> None:
     """`ulimit -e unlimited` is -1 to Python."""
     monkeypatch.setattr(group_trees, "_CAP_SYS_NICE", 0)

@@ -62,6 +62,19 @@ def test_older_files_of_running_processes_are_removed_when_nothing_else_is_left(
         assert set(ages) == set(range(max(ages) + 1))
 
 
+def test_a_log_that_was_opened_ahead_stays(tmp_path, folder):
+    """Its process is going to write into it."""
+    keeper = LogKeeper(str(tmp_path), LIMITS)
+    keeper.prepare(("held", 1), ())
+    for number in range(40):
+        run(keeper, (f"job{number}", 1), 900)
+        keeper.release((f"job{number}", 1))
+    assert (folder / "held.1.log").exists()
+    assert not (folder / "job0.1.log").exists()
+    keeper.release(("held", 1))
+    assert not (folder / "held.1.log").exists()
+
+
 def test_logs_of_a_former_supervisor_count(tmp_path, folder):
     for number in range(30):
         (folder / f"job{number:02}.1.log").write_bytes(b"x" * 1000)

@@ -37,6 +37,17 @@ def test_an_old_log_that_cannot_be_removed_prevents_no_start(state, monkeypatch,
     assert "talker.1" in capfd.readouterr().err
 
 
+def test_a_log_that_was_opened_ahead_is_opened_again_if_a_user_removed_it(state):
+    """Otherwise the output would go to a file without a name."""
+    keeper, path = LogKeeper(state, LogLimits()), Path(paths.log_file(state, "talker", 1))
+    keeper.prepare(("talker", 1), ())
+    path.unlink()
+    log = keeper.open(("talker", 1), ())
+    os.write(log, b"hello\n")
+    os.close(log)
+    assert path.read_text() == "hello\n"
+
+
 def test_an_index_without_room_stays_as_it_was(state, monkeypatch):
     """Half a record would move all offsets, and the new file would stay beside the old one."""
     log, write = paths.log_file(state, "talker", 1), os.write
