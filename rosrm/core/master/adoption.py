@@ -22,8 +22,6 @@ from rosrm.wording import no_such
 
 def check_adoption(state: MasterState, adoption: Adoption, now: float) -> None:
     """Refuse an adoption on a host that is unknown or away, or of a process that rosrm runs."""
-    if adoption == NO_ADOPTION:
-        return
     host = state.hosts.by_name.get(adoption.host)
     if host is None:
         raise RequestRefused(no_such("host", [adoption.host], list(state.hosts.by_name)), "unknown")

@@ -496,9 +496,10 @@ class MasterState:
         """Add an instance on the host that a ranking has chosen."""
         demand = ranking.demand
         # Without devices the slave refuses the instance, and the process is placed elsewhere.
-        devices = self.hosts.devices[host.column].choose(demand.spec.devices) or ()
+        needs, devices = demand.spec.devices, self.hosts.devices[host.column]
+        chosen = (devices.choose(needs) or ()) if needs else ()
         need = ranking.need[:, host.column]
-        self.add_instance(instance, host, now, demand, need, devices=devices)
+        self.add_instance(instance, host, now, demand, need, devices=chosen)
 
     def note_held(self, instance: Instance, devices: tuple[HeldDevice, ...]) -> None:
         """Note the devices that an instance holds by the report of its slave.

@@ -71,11 +71,12 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_gangs(state, specs, event.by.name)
     check_quota(state, specs, event.by)
-    for spec in specs:
-        check_adoption(state, spec.adoption, now)
+    adopted = {spec.name: spec.adoption for spec in specs if spec.adoption != NO_ADOPTION}
+    for adoption in adopted.values():
+        check_adoption(state, adoption, now)
     processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
     for process in processes:
-        if process.spec.adoption != NO_ADOPTION:
+        if process.name in adopted:
             assign_to_adopt(state, process, now)
     own = {one.name: one.node for one in processes}
     others = {name: node for node in own.values() for name in state.nodes.get(node, ())}
@@ -235,6 +236,8 @@ def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
         return f"migration by {strategy!r}: {fault}"
     if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
         return no_standby(strategy, state.declared.capabilities)
+    if not spec.container.image:
+        return ""
     return container_conflict(spec, state.declared.capabilities_of(spec))
 
 

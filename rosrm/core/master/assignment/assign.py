@@ -368,9 +368,10 @@ def _take_place(
     state.set_phase(process, ProcessPhase.ASSIGNED, now)
     state.note_decision(process, decision, "assigned", now)
     devices = [str(one) for one in state.instances[instance.number].devices]
+    with_them = f" with {listed(devices)}" if devices else ""
     state.record(
         now, EventKind.ASSIGNED,
-        f"{process.name} is assigned to {host.name}" + (f" with {listed(devices)}" * bool(devices)),
+        f"{process.name} is assigned to {host.name}{with_them}",
         process=process.name, host=host.name,
         facts={"number": instance.number, "decision": process.decision, "devices": devices},
     )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.devices import Inventory
 from rosrm.core.master.state.host_arrays import BUSY, FloatArray, IntArray
 from rosrm.core.master.state.hosts import Host, HostTable
-from rosrm.extensions.contracts import HostView
+from rosrm.extensions.contracts import HostView, ProcessView
 from rosrm.extensions.link_views import FlowView
 from rosrm.model.values import EMPTY, ProcessSpec
 
@@ -42,6 +42,7 @@ class Candidates:
         tenants: (n,) name to spec of each process on the host; None: as the table has them now.
         tenants_read: True if a plugin has read which processes run on one of the hosts.
         view: of the hosts for plugins; None: not made yet.
+        process_views: fields that a plugin reads to its view of the process, unless it has flows.
     """
 
     table: HostTable
@@ -61,6 +62,7 @@ class Candidates:
     tenants: tuple[Mapping[str, ProcessSpec], ...] | None = None
     tenants_read: bool = False
     view: HostView | None = None
+    process_views: dict[tuple[str, ...], ProcessView] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.processes)

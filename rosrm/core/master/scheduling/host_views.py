@@ -49,10 +49,16 @@ def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
 
     `reads`: fields of the spec that the offer of the plugin declares.
     """
-    spec = declared_spec(hosts.demand.spec, reads)
+    known = hosts.process_views.get(reads)
+    if known is not None:
+        return known
     has_flows = FLOWS_FIELD in reads and hosts.demand.traffic.flows
     flows = hosts.flows() if has_flows else no_flows()
-    return ProcessView(spec, _read_only(hosts.need.T), flows)
+    spec = declared_spec(hosts.demand.spec, reads)
+    view = ProcessView(spec, _read_only(hosts.need.T), flows)
+    if not has_flows:  # their round trips and rates change with the links
+        hosts.process_views[reads] = view
+    return view
 
 
 def _read_only(view: npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -20,6 +20,8 @@ from rosrm.extensions.plugin_calls import required
 
 def passing_plugins(hosts: Candidates) -> BoolArray | None:
     """Return the mask, (n,), of the hosts that pass the filters of plugins; None: all pass."""
+    if not hosts.demand.plugins.filters:
+        return None
     masks = [_mask(one, hosts) for one in _asked(hosts)]
     if not masks:
         return None

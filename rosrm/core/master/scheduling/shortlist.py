@@ -72,7 +72,7 @@ class Shortlist:
     def _search(self) -> list[tuple[float, int]]:
         value, found = self._value, list[tuple[float, int]]()
         self._end = _NONE
-        while len(found) < min(self._searched, len(value)):
+        for _ in range(min(self._searched, len(value))):
             column = int(value.argmin())
             lowest = float(value[column])
             if lowest == inf:

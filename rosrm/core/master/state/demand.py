@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from rosrm.core.master.state.links import Crossing
 from rosrm.extensions.declared_fields import STANDARD_FIELDS
@@ -87,7 +87,7 @@ class RankingKey:
         return isinstance(other, RankingKey) and self._values == other._values
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen, because that costs 1 µs for each of thousands
 class Demand:
     """Inputs of the placement of one process; equal demands share a ranking.
 
@@ -117,17 +117,18 @@ class Demand:
     key_alone: RankingKey = field(init=False, compare=False)
 
     def __post_init__(self) -> None:
+        mappings = (*_mappings_of(self.spec), self.amounts, self.excluded)
         read = self.shared_plugins.reads
-        alone = RankingKey(
-            *_plain_fields_of(self.spec), *map(_key, _mappings_of(self.spec)),
-            _key(self.amounts), self.estimated, _key(self.excluded), self.headroom, self.near,
-            *map(self._as_text, read),
+        self.key_alone = RankingKey(
+            *_plain_fields_of(self.spec), self.estimated,
+            *[tuple(sorted(one.items())) if one else () for one in mappings],
+            self.headroom, self.near, *map(self._as_text, read),
         )  # fmt: skip
-        also_read = (name for name in self.plugins.reads if name not in read)
-        traffic = (self.traffic, *map(self._as_text, also_read)) if self.traffic.flows else ()
-        around = (*self.neighbours, *traffic)
-        object.__setattr__(self, "key_alone", alone)
-        object.__setattr__(self, "key", RankingKey(alone, *around) if around else alone)
+        around: tuple[Hashable, ...] = self.neighbours
+        if self.traffic.flows:
+            also_read = (name for name in self.plugins.reads if name not in read)
+            around = (*around, self.traffic, *map(self._as_text, also_read))
+        self.key = RankingKey(self.key_alone, *around) if around else self.key_alone
 
     def _as_text(self, field_name: str) -> str:
         """Return a field of the spec as text: 1, 1.0 and True are equal, a policy can tell them."""
@@ -151,7 +152,3 @@ class Demand:
     def declared(self) -> frozenset[str]:
         """Return the resources that a host must have."""
         return frozenset(name for name, much in self.amounts.items() if much > 0) - self.estimated
-
-
-def _key(mapping: Mapping[str, Any]) -> tuple[tuple[str, Any], ...]:
-    return tuple(sorted(mapping.items())) if mapping else ()

@@ -352,7 +352,7 @@ class HostTable(HostColumns):
     def hold(self, host: Host, instance: InstanceId, held: tuple[HeldDevice, ...]) -> None:
         """Note that an instance holds these devices of a host and no others."""
         before = self.devices[host.column]
-        if before.held.get(instance, ()) != held:
+        if (held or before.held) and before.held.get(instance, ()) != held:
             self.devices[host.column] = before.with_held(instance, held)
 
     def saved(self, host: Host) -> SavedColumn:

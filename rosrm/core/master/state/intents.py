@@ -74,7 +74,8 @@ def process_intent(tables: Tables, process: Process) -> Intent:
     return Intent(
         "process", process.name,
         {
-            "spec": process.plain, "next_spec": to_plain(process.next_spec),
+            "spec": process.plain,
+            "next_spec": process.next_spec and to_plain(process.next_spec),
             "phase": phase.value, "since": began,
             "host": owner.host.name if owner else process.ended_on,
             "instances": {number: one.host.name for number, one in instances},
