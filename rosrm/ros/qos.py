@@ -33,7 +33,12 @@ BEAT_IN: Final = best_effort(depth=1)
 LOAD: Final = reliable(depth=5)
 #: As the publishers of ROS's own package diagnostic_updater.
 DIAGNOSTICS: Final = reliable(depth=10)
-#: The master's newest messages about every handoff: two for each phase, one for each node.
+#: The master's messages about every handoff, as a node receives them.
 STATE_CONFIG: Final = latched(depth=200)
+#: As the master keeps them for nodes that join: two for each phase, one for each node. Fast DDS
+#: sends all of them to each new reader, and with each one a heartbeat to every node. The 600
+#: packets of 200 messages overflowed the socket of a busy source, whose inputs then stopped until
+#: their publisher's next heartbeat (3 s). The master repeats a phase without a reply.
+STATE_CONFIG_OUT: Final = latched(depth=20)
 #: One handoff: a restarted master receives the reports that it has missed.
 HANDOFF: Final = latched(depth=20)

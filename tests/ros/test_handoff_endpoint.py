@@ -124,6 +124,16 @@ def test_the_state_config_reaches_late_subscribers(stage):
     assert (source, destination) == ([expected], [expected])
 
 
+def test_a_late_subscriber_receives_only_the_newest_messages(stage):
+    """Older ones, with a heartbeat each to every node, would overflow the sockets of the nodes."""
+    for _ in range(50):
+        stage.say(HandoffPhase.SHADOW)
+    stage.say(HandoffPhase.SWITCH)
+    source = stage.listen(1)
+    stage.wait(lambda: source and source[-1].phase == HandoffPhase.SWITCH, "the last message")
+    assert len(source) <= 10
+
+
 def test_an_instance_without_a_key_gets_no_message():
     """The grant of its host was revoked; the other one still learns of the end of the handoff."""
     keys = HandoffKeys(

@@ -89,7 +89,7 @@ class HandoffEndpoint:
         self._refuse = refuse
         self._keys = keys
         self._configs = participant.node.create_publisher(
-            msg.Sealed, self._names(names.STATE_CONFIG), qos.STATE_CONFIG
+            msg.Sealed, self._names(names.STATE_CONFIG), qos.STATE_CONFIG_OUT
         )
         self._handoffs: dict[str, _Handoff] = {}
         self._askers: OrderedDict[tuple[str, int], _Asker] = OrderedDict()
