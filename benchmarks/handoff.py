@@ -3,9 +3,10 @@
 `--strategy handoff` (the default): a stateful node answers the inputs of a driver, or counts by a
 timer of its own (`--driven timer`), while it migrates to and fro. Lost, repeated and out of order
 are counted in its answers. The gap is the time from the source's last output to the destination's
-first, minus one period. `--strategy relaunch`: a stateless node publishes in each cycle. The gap is
-the same, and negative if both were active for a moment. Lost are the cycles in which no instance
-was active, repeated those in which both were.
+first, minus the time between the inputs that they answer (`--driven timer`: minus one period).
+`--strategy relaunch`: a stateless node publishes in each cycle. The gap is the same, minus one
+period, and negative if both were active for a moment. Lost are the cycles in which no instance was
+active, repeated those in which both were.
 """
 
 from __future__ import annotations
@@ -56,12 +57,14 @@ class Output(NamedTuple):
         instance: the number of its publisher.
         sequence: outputs of the node so far, with this one; 0 for a stateless node.
         answered: the input that it answers, numbered from 1.
+        sent: unix time of that input in ns; 0: the node has no driver.
     """
 
     received: int
     instance: int
     sequence: int
     answered: int
+    sent: int = 0
 
 
 @dataclass
@@ -70,9 +73,10 @@ class Outcome:
 
     Attributes:
         ends: "migrated" or "stayed", of each migration.
-        gaps: seconds beyond one period, of each change of the publisher.
+        gaps: seconds beyond the time between two inputs, of each change of the publisher.
         lost, repeated, out_of_order: outputs, or inputs without an answer or with several.
         moves: seconds from each request to the end of its migration.
+        driver_late: most seconds by which the input of a destination's first output was late.
     """
 
     ends: list[str]
@@ -81,6 +85,7 @@ class Outcome:
     repeated: int
     out_of_order: int
     moves: list[float] = field(default_factory=list)
+    driver_late: float = 0.0
 
 
 class Observer:
@@ -164,13 +169,16 @@ def move(cluster: LocalCluster) -> str:
     raise TimeoutError(f"the migration to {there} did not end within {_PATIENCE:g} s")
 
 
-def gaps_of_handoff(outputs: Sequence[Output], period: float) -> list[float]:
-    """Return the gaps: seconds beyond one period between the outputs of two instances."""
-    return [
-        (after.received - before.received) / _NS - period
-        for before, after in itertools.pairwise(outputs)
-        if before.instance != after.instance
-    ]
+def changes(outputs: Sequence[Output]) -> list[tuple[Output, Output]]:
+    """Return the last output of each source with the first of its destination."""
+    pairs = itertools.pairwise(outputs)
+    return [(before, after) for before, after in pairs if before.instance != after.instance]
+
+
+def gap(before: Output, after: Output, period: float) -> float:
+    """Return the seconds between two outputs beyond the time between their inputs."""
+    expected = (after.sent - before.sent) / _NS if after.sent else period
+    return (after.received - before.received) / _NS - expected
 
 
 def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
@@ -183,7 +191,10 @@ def outcome_of_handoff(ends: list[str], outputs: Sequence[Output], period: float
     )
     repeated = max(len(numbers) - len(set(numbers)) for numbers in (answered, sequence))
     disorder = sum(later < earlier for earlier, later in itertools.pairwise(sequence))
-    return Outcome(ends, gaps_of_handoff(outputs, period), missing, repeated, disorder)
+    moved = changes(outputs)
+    gaps = [gap(before, after, period) for before, after in moved]
+    late = [(after.sent - before.sent) / _NS - period for before, after in moved if after.sent]
+    return Outcome(ends, gaps, missing, repeated, disorder, driver_late=max(late, default=0.0))
 
 
 def outcome_of_relaunch(ends: list[str], outputs: Sequence[Output], period: float) -> Outcome:
@@ -269,6 +280,7 @@ def main() -> None:
             "gap_max_ms": round(max(gaps) * 1e3, 3) if gaps else None,
             "move_p50_s": round(percentile(outcome.moves, 0.5), 2),
             "move_max_s": round(max(outcome.moves), 2),
+            "driver_late_max_ms": round(outcome.driver_late * 1e3, 3),
             "moved": outcome.ends.count("migrated"), "stayed": outcome.ends.count("stayed"),
             "transports": transports,
         },

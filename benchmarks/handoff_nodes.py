@@ -1,7 +1,8 @@
 """Nodes that `benchmarks.handoff` migrates, and the driver that publishes their inputs.
 
 Each output is [instance, sequence, input]: the publishing instance, the number of outputs up to
-this one, and the number of the input that it answers.
+this one, and the number of the input that it answers. An answer also has the time at which its
+input was sent (unix time in ns).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import rclpy
 import rclpy.node
@@ -43,9 +45,10 @@ class Echo(Node):
         self.create_subscription(Int64, INPUT, self.answer, QOS)
         self.keep_state("~/state", Int64, self.save, self.restore)
 
-    def answer(self, message: Int64) -> None:
+    def answer(self, message: Int64, info: Any) -> None:
         self.sequence += 1
-        self.output.publish(Int64MultiArray(data=[instance(), self.sequence, message.data]))
+        answer = [instance(), self.sequence, message.data, info["source_timestamp"]]
+        self.output.publish(Int64MultiArray(data=answer))
 
     def save(self) -> Int64:
         return Int64(data=self.sequence)
