@@ -314,17 +314,23 @@ class NodeEntities:
                 timer.started = not timer.timer.is_canceled()
             timer.stop()
         self._due_at_start = None
-        self._close_all(OpeningOf)
+        for opening in self._openings:
+            if isinstance(opening, OpeningOf):
+                self._close(opening)
         return due
 
-    def close_services(self) -> None:
-        """Close all services: the successor answers, and requests to this node would be lost."""
-        self._close_all(ServiceOf)
+    def services_closing(self) -> Iterator[None]:
+        """Close all services, while this node is silent; yield after each one.
 
-    def _close_all(self, kind: type[ServiceOf | OpeningOf]) -> None:
-        for opening in self._openings:
-            if isinstance(opening, kind):
+        The successor answers, and requests to this node would be lost. The author's services come
+        first, and those of ROS for the parameters last.
+        """
+        for opening in reversed(self._openings):
+            if self.mode is not Mode.SILENT:
+                return
+            if isinstance(opening, ServiceOf):
                 self._close(opening)
+                yield
 
     def _close(self, opening: ServiceOf | OpeningOf) -> None:
         try:

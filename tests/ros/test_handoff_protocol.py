@@ -20,7 +20,7 @@ from std_msgs.msg import Int64, String
 from std_srvs.srv import Trigger
 
 from rosrm.node import Node
-from rosrm.node.handoff import stranded
+from rosrm.node.handoff import source, stranded
 from rosrm.ros.qos import latched
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark, StatePart
@@ -34,6 +34,7 @@ from tests.ros.nodes import (
     Conductor,
     Counter,
     Counting,
+    Server,
     Stage,
     buffered,
     pair_of,
@@ -217,6 +218,16 @@ def test_a_service_is_served_by_the_active_node_alone(stage, server):
     stage.spin_until(lambda: _servers(stage, "/counter/poke") == [ALIAS], "the successor's service")
     assert [call() for _ in range(3)] == [ALIAS] * 3
     assert (pair.first.served, pair.second.served) == (3, 3)
+
+
+def test_a_source_closes_its_services_one_by_one(stage, monkeypatch):
+    """All at once would delay the first outputs of the successor. The author's come first."""
+    monkeypatch.setattr(source, "_CLOSE_EVERY", 600.0)
+    pair = pair_of(stage, Server)
+    stage.spin_until(lambda: _servers(stage, "/counter/poke") == ["counter"], "the service")
+    pair.conductor.hand_over()
+    stage.spin_until(lambda: _servers(stage, "/counter/poke") == [ALIAS], "the successor's service")
+    assert "counter" in _servers(stage, "/counter/get_parameters")
 
 
 def _servers(stage, name):
