@@ -398,7 +398,7 @@ class MasterRuntime:
             return
         self._state.wall = time.time()
         core_now, spent = self._core_now(now), self._deadlines.spent
-        while self._held is None and (events := self._endpoint.take_events()):
+        while self._held is None and (events := self._take_events()):
             commands: list[Command] = []
             for event in events:
                 begun = self._now()
@@ -412,6 +412,9 @@ class MasterRuntime:
                 self._carry_out(commands, now)
         if self._held is None:
             self._leave_out_blocked(self._deadlines.spent - spent)
+
+    def _take_events(self) -> list[happened.Event]:
+        return self._endpoint.take_events(queued=len(self._state.queue) > 0)
 
     def _leave_out_blocked(self, blocked: float) -> None:
         """Set the core's clock back by the seconds for which plugins blocked the master.

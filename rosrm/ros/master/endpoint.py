@@ -110,13 +110,24 @@ class MasterEndpoint:
             # Placed first, because a usage must not be judged by readings older than it.
             self.events.insert(0, readings)
 
-    def take_events(self) -> list[happened.Event]:
-        """Return the events since the last call, in order, preceded by the newest readings."""
-        if self.events and not isinstance(self.events[0], happened.ReadingsReceived):
+    def take_events(self, *, queued: bool = True) -> list[happened.Event]:
+        """Return the events since the last call, in order, preceded by the newest readings.
+
+        Args:
+            queued: False if no process is queued. Then requests for work decide nothing, and the
+                readings can wait for the next tick.
+        """
+        if not self._begin_with_readings() and (queued or not self._are_requests_for_work()):
             self._guard.call(self._take_readings)
         events = list(self.events)
         self.events.clear()
         return events
+
+    def _begin_with_readings(self) -> bool:
+        return not self.events or isinstance(self.events[0], happened.ReadingsReceived)
+
+    def _are_requests_for_work(self) -> bool:
+        return all(isinstance(event, happened.ProcessRequested) for event in self.events)
 
     def beat(self, uptime: float, silent_hosts: Sequence[int], journal: int) -> None:
         """Publish the master's beat, and its load at most once a second.

@@ -26,6 +26,8 @@ LAYOUT: Final = np.dtype(
         ("limits", "<u4"), ("limit", "<f4", (RESOURCE_SLOTS,)),
     ]
 )  # fmt: skip
+#: The same without fields, because numpy copies rows with fields one field at a time.
+_ROW: Final = np.dtype((np.void, LAYOUT.itemsize))
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +73,9 @@ def decode(messages: Sequence[bytes]) -> Decoded:
     """
     fit = [raw for raw in messages if len(raw) == LAYOUT.itemsize and raw[1] == 1]
     rows = np.frombuffer(b"".join(fit), LAYOUT)
-    rows = rows[(rows["usages"] == RESOURCE_SLOTS) & (rows["limits"] == RESOURCE_SLOTS)]
+    right = (rows["usages"] == RESOURCE_SLOTS) & (rows["limits"] == RESOURCE_SLOTS)
+    if not right.all():
+        rows = rows[right]
     refusals = []
     if len(rows) < len(messages):
         refusals.append("a resource_info of another size than ours: another version of rosrm?")
@@ -87,8 +91,10 @@ def decode(messages: Sequence[bytes]) -> Decoded:
         if not len(rows):
             return Decoded(refusals=tuple(refusals))
     order, begins = _by_run(rows)
-    newest = rows[order[np.append(begins[1:], len(rows)) - 1]]
-    return Decoded(_event(newest), _runs(rows[order], begins, newest), tuple(refusals), len(rows))
+    last = order[np.append(begins[1:], len(rows)) - 1]
+    newest = rows.view(_ROW)[last].view(LAYOUT)
+    runs = _runs(rows, order, begins, newest)
+    return Decoded(_event(newest), runs, tuple(refusals), len(rows))
 
 
 def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
@@ -105,10 +111,11 @@ def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArr
 
 
 def _runs(
-    rows: npt.NDArray[np.void], begins: npt.NDArray[np.intp], newest: npt.NDArray[np.void]
-) -> Runs:
-    sequence = rows["sequence"].astype(np.int64)
-    spans = (rows["flags"] >> QUIET_SHIFT).astype(np.int64) + 1
+    rows: npt.NDArray[np.void], order: npt.NDArray[np.intp], begins: npt.NDArray[np.intp],
+    newest: npt.NDArray[np.void],
+) -> Runs:  # fmt: skip
+    sequence = rows["sequence"][order].astype(np.int64)
+    spans = (rows["flags"][order] >> QUIET_SHIFT).astype(np.int64) + 1
     return Runs(
         host_id=newest["host_id"].astype(np.int64),
         incarnation=newest["incarnation"].copy(),

@@ -34,10 +34,10 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
     clock, events = Clock(takes, plugins), [[happened.TimePassed()], []]
     monkeypatch.setattr(runtime, "step", clock.step)
     master = MasterRuntime.__new__(MasterRuntime)
-    master._state, master._behind = SimpleNamespace(), 0.0
+    master._state, master._behind = SimpleNamespace(queue=[]), 0.0
     master._recorder = master._held = None
     master._deadlines = clock
-    master._endpoint = SimpleNamespace(take_events=lambda: events.pop(0))
+    master._endpoint = SimpleNamespace(take_events=lambda queued: events.pop(0))
     monkeypatch.setattr(master, "_now", lambda: clock.now)
     master._take_in(clock.now)
     clock.now += 0.05
