@@ -173,7 +173,7 @@ def main() -> None:
         "--settle", type=float, default=30.0, help="seconds before each round of scale"
     )
     # The rest of the options of `benchmarks.scale`.
-    command_line.set_defaults(hz=10.0, step=STEP, processes=2, timeout=240.0)
+    command_line.set_defaults(hz=10.0, step=STEP, processes=2, timeout=240.0, jobs=scale.JOBS)
     options = command_line.parse_args()
     transports = isolated_transports()
     figures: dict[str, Any] = {}
