@@ -165,6 +165,10 @@ def _size(message: Any) -> int:
                 size += len(text)
         elif nested:
             size += sum(map(_size, value)) if entries else _size_of_known(value)
+    if size > LARGEST_SPEC and kind is msg.ProcessSpec:
+        raise Refused(
+            f"process {message.name!r:.60}: its texts have {size} letters; at most {LARGEST_SPEC}"
+        )
     return size
 
 

@@ -28,8 +28,11 @@ from rosrm_msgs import msg
 _HEADER: Final = b"\x00\x01"
 _HEADER_BYTES: Final = 4
 _LENGTH: Final = struct.Struct("<I").unpack_from
+_pack_count: Final = struct.Struct("<I").pack
 #: Largest alignment in CDR.
 _ALIGNMENT: Final = 8
+#: Bytes before a value, by their number.
+_GAPS: Final = [bytes(count) for count in range(_ALIGNMENT)]
 #: Forms of one nested message that are kept for each alignment, and most bytes of one.
 _KEPT: Final = 4
 _MOST_BYTES: Final = 512
@@ -131,6 +134,8 @@ def _read_text(content: bytes, at: int) -> tuple[str, int]:
     begin, end = at + 4, at + 4 + length
     if end > len(content):
         raise _short()
+    if length == 1 and not content[begin]:
+        return "", end
     # As in rclpy, a text ends at its first NUL, which no path or argument may have.
     return content[begin:end].split(b"\0", 1)[0].decode("utf-8", "replace"), end
 
@@ -274,9 +279,10 @@ def _caching(write_new: _Writer) -> _Writer:
 
 def _write_text(text: str, parts: list[bytes], at: int) -> int:
     form = text.encode() + b"\0"
-    at = _write_count(len(form), parts, at)
-    parts.append(form)
-    return at + len(form)
+    length = len(form)
+    gap = -at % 4
+    parts.append(_GAPS[gap] + _pack_count(length) + form)
+    return at + gap + 4 + length
 
 
 def _number_writer(code: str) -> _Writer:
@@ -285,13 +291,13 @@ def _number_writer(code: str) -> _Writer:
 
     def write_number(number: Any, parts: list[bytes], at: int) -> int:
         gap = -at % size
-        parts.append(bytes(gap) + pack(number))
+        parts.append(_GAPS[gap] + pack(number) if gap else pack(number))
         return at + gap + size
 
     return write_number
 
 
-#: Writes the count of a sequence, and the length of a text.
+#: Writes the count of a sequence.
 _write_count: Final = _number_writer("I")
 
 

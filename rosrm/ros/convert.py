@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import is_dataclass, replace
+from dataclasses import MISSING, Field, fields, is_dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
 from typing import Any, Final, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
@@ -44,7 +44,7 @@ from rosrm.model.parameters import pattern_fault
 from rosrm.model.remembered import remembered
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.secret_rules import secrets_fault
-from rosrm.ros.bounds import LARGEST_SPEC, MOST_LETTERS, check_bounds
+from rosrm.ros.bounds import MOST_LETTERS
 from rosrm.ros.cdr import made
 from rosrm.wording import sanitized, sendable
 from rosrm_msgs import msg
@@ -128,6 +128,7 @@ class _Field(NamedTuple):
         slot: attribute of messages with its value. The property `sent_as` is slower.
         to_msg: converts its value to that in messages.
         from_msg: the inverse of `to_msg`.
+        is_default_empty: zero, and an empty text or sequence, stand for the default.
     """
 
     name: str
@@ -135,17 +136,24 @@ class _Field(NamedTuple):
     slot: str
     to_msg: _Convert
     from_msg: _Convert
+    is_default_empty: bool
 
 
 def _fields(kind: Any) -> tuple[_Field, ...]:
     """Return the fields of a dataclass."""
-    found = []
-    for name, hint in get_type_hints(kind).items():
+    found, hints = [], get_type_hints(kind)
+    for field in fields(kind):
+        name, hint = field.name, hints[field.name]
         sent_as = _RENAMED.get(name, name)
         # Only the property converts numbers to an array.
         slot = sent_as if hint == tuple[int, ...] else f"_{sent_as}"
-        found.append(_Field(name, sent_as, slot, *_forms(hint)))
+        found.append(_Field(name, sent_as, slot, *_forms(hint), _is_default_empty(field, hint)))
     return tuple(found)
+
+
+def _is_default_empty(field: Field[Any], hint: Any) -> bool:
+    made = field.default if field.default_factory is MISSING else field.default_factory()
+    return not made and (made is not None or hint == str | None)
 
 
 #: Typed, because mypy does not accept a type as an argument of a cache.
@@ -179,7 +187,7 @@ def _unchanged(value: Any) -> Any:
 def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
     """Return a dataclass as a message of a type with the same fields; `others` are converted."""
     converted = made(message, **others)
-    for name, sent_as, slot, convert, _ in _known_fields(type(value)):
+    for name, sent_as, slot, convert, _, _ in _known_fields(type(value)):
         if sent_as not in others:
             field = getattr(value, name)
             setattr(converted, slot, field if convert is _unchanged else convert(field))
@@ -189,9 +197,9 @@ def _to_msg(message: Any, value: Any, /, **others: Any) -> Any:
 def _from_msg(wanted: type[_Value], message: Any, /, **others: Any) -> _Value:
     """Return the inverse of `_to_msg`."""
     same = {
-        name: convert(getattr(message, slot))
-        for name, _, slot, _, convert in _known_fields(wanted)
-        if name not in others
+        name: convert(value)
+        for name, _, slot, _, convert, is_default_empty in _known_fields(wanted)
+        if name not in others and ((value := getattr(message, slot)) or not is_default_empty)
     }
     return wanted(**same, **others)
 
@@ -231,7 +239,10 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
 
 
 def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
-    """Return the inverse of `spec_to_msg`; raises `Refused` for an invalid spec."""
+    """Return the inverse of `spec_to_msg`; raises `Refused` for an invalid spec.
+
+    The receiver of the message has checked its bounds.
+    """
     fault = _spec_fault(message)
     if fault:
         raise Refused(f"process {message.name!r:.60}: {fault}")
@@ -379,7 +390,7 @@ def _rollout_fault(message: msg.ApplicationTarget) -> str:
 
 def _spec_fault(message: msg.ProcessSpec) -> str:
     """Return a fault that rosrm's own clients would not send, though others might; "": none."""
-    fault = _name_fault(message) or _size_fault(message)
+    fault = _name_fault(message)
     if fault:
         return fault
     forms = [bool(message.package), bool(message.module), bool(message.command)]
@@ -421,11 +432,6 @@ def _names_fault(message: msg.ProcessSpec) -> str:
         if fault:
             return fault
     return ""
-
-
-def _size_fault(message: msg.ProcessSpec) -> str:
-    size = check_bounds(message)
-    return f"its texts have {size} letters; at most {LARGEST_SPEC}" if size > LARGEST_SPEC else ""
 
 
 def _needs_fault(message: msg.ProcessSpec) -> str:

@@ -15,6 +15,7 @@ from rosrm.model import values
 from rosrm.model.adoption import Adoption
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.ros import control, convert
+from rosrm.ros.bounds import check_bounds
 from rosrm_msgs import msg
 from tests.drawing import PRINTABLE, SPECS, drawn
 
@@ -318,6 +319,12 @@ def test_the_paths_of_given_fields_are_sent() -> None:
     assert convert.spec_from_msg(convert.spec_to_msg(spec)).given == spec.given
 
 
+def received_spec(message):
+    """Return the spec in a message, as a receiver does."""
+    check_bounds(message)
+    return convert.spec_from_msg(message)
+
+
 @pytest.mark.parametrize("what", NONSENSE_IN_SPECS)
 def test_spec_that_makes_no_process_is_refused(what) -> None:
     """Any client may send an invalid spec: the refusal has a reason, and nothing else is raised."""
@@ -328,7 +335,7 @@ def test_spec_that_makes_no_process_is_refused(what) -> None:
     NONSENSE_IN_SPECS[what](message)
 
     with pytest.raises(Refused) as refusal:
-        convert.spec_from_msg(message)
+        received_spec(message)
     assert len(str(refusal.value)) < 500
 
 
