@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from nacl.bindings import crypto_generichash_blake2b_salt_personal, sodium_memcmp
+from typing import Final
+
+# Not the function of `nacl.bindings`, whose checks take most of the time of a short digest.
+from nacl._sodium import ffi, lib
+from nacl.bindings import sodium_memcmp
+
+_PERSON_BYTES: Final = 16
 
 #: Return True if two digests are equal, in a time that does not depend on their content.
 are_equal = sodium_memcmp
@@ -16,5 +22,16 @@ def digest_of(content: bytes, size: int, person: bytes, key: bytes = b"") -> byt
         size: of the digest, in bytes.
         person: separates this use of BLAKE2b from every other one; at most 16 bytes.
         key: secret; only its holders can compute the digest; b"": anyone can.
+
+    Raises:
+        ValueError: the size, or the length of the person or key, is out of range.
     """
-    return crypto_generichash_blake2b_salt_personal(content, size, key, person=person)
+    digest = bytearray(size)
+    padded = person.ljust(_PERSON_BYTES, b"\0")  # libsodium reads all of its bytes
+    if len(padded) > _PERSON_BYTES or lib.crypto_generichash_blake2b_salt_personal(
+        ffi.from_buffer(digest), size, content, len(content), key, len(key), ffi.NULL, padded
+    ):
+        raise ValueError(
+            f"no BLAKE2b digest of {size} bytes for {person!r}, key of {len(key)} bytes"
+        )
+    return bytes(digest)

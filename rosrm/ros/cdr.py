@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import struct
 from array import array
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
+from itertools import groupby
 from typing import Any, Final
 
 from rclpy.serialization import serialize_message
@@ -77,15 +78,18 @@ def _short() -> ValueError:
 
 
 def _new_reader(kind: Any) -> _Reader:
-    declared = kind.get_fields_and_field_types()
-    fields = [(f"_{name}", _reader(type_)) for name, type_ in declared.items()]
+    fields = [*_fields_to_read(kind.get_fields_and_field_types())]
 
     def read_message(content: bytes, at: int) -> tuple[Any, int]:
         message = kind.__new__(kind)
         message._check_fields = False  # noqa: SLF001 - as the constructor does
         for name, read_field in fields:
             value, at = read_field(content, at)
-            setattr(message, name, value)
+            if isinstance(name, str):
+                setattr(message, name, value)
+                continue
+            for one, number in zip(name, value, strict=True):
+                setattr(message, one, number)
         return message, at if fields else at + 1  # a message without fields has one byte
 
     return read_message
@@ -95,14 +99,27 @@ def _new_reader(kind: Any) -> _Reader:
 _message_reader: Final[Callable[[Any], _Reader]] = cache(_new_reader)
 
 
+def _fields_to_read(
+    declared: Mapping[str, str],
+) -> Iterator[tuple[str | tuple[str, ...], _Reader]]:
+    """Yield the attribute of each field with its reader; numbers in a row have one reader."""
+    for are_numbers, group in groupby(declared.items(), lambda one: one[1] in _CODES):
+        if are_numbers:
+            names, types = zip(*group, strict=True)
+            yield (
+                tuple(f"_{name}" for name in names),
+                _numbers_reader("".join(map(_CODES.__getitem__, types))),
+            )
+        else:
+            yield from ((f"_{name}", _reader(type_)) for name, type_ in group)
+
+
 def _reader(declared: str) -> _Reader:
     """Return the reader of a field by its type, as rosidl writes it."""
     if declared == "string":
         return _read_text
     if declared.startswith("sequence<"):
         return _sequence_reader(declared.removeprefix("sequence<").removesuffix(">"))
-    if declared in _CODES:
-        return _number_reader(_CODES[declared])
     return _known(_message_reader(_kind(declared)))
 
 
@@ -140,20 +157,31 @@ def _read_text(content: bytes, at: int) -> tuple[str, int]:
     return content[begin:end].split(b"\0", 1)[0].decode("utf-8", "replace"), end
 
 
-def _number_reader(code: str) -> _Reader:
-    form = struct.Struct(f"<{code}")
-    size, unpack = form.size, form.unpack_from
+def _numbers_reader(codes: str) -> _Reader:
+    """Return the reader of numbers of these types in a row."""
+    forms = [_form_at(alignment, codes) for alignment in range(_ALIGNMENT)]
 
-    def read_number(content: bytes, at: int) -> tuple[Any, int]:
-        at += -at % size
-        return unpack(content, at)[0], at + size
+    def read_numbers(content: bytes, at: int) -> tuple[tuple[Any, ...], int]:
+        form = forms[at % _ALIGNMENT]
+        return form.unpack_from(content, at), at + form.size
 
-    return read_number
+    return read_numbers
+
+
+def _form_at(at: int, codes: str) -> struct.Struct:
+    """Return the form of numbers in a row of which the first one begins at an offset."""
+    layout = "<"
+    for code in codes:
+        size = struct.calcsize(f"<{code}")
+        gap = -at % size
+        layout += f"{gap}x{code}"
+        at += gap + size
+    return struct.Struct(layout)
 
 
 def _sequence_reader(inner: str) -> _Reader:
     if inner in _CODES:
-        return _numbers_reader(_CODES[inner])
+        return _array_reader(_CODES[inner])
     read_one = _read_text if inner == "string" else _message_reader(_kind(inner))
 
     def read_sequence(content: bytes, at: int) -> tuple[list[Any], int]:
@@ -171,10 +199,10 @@ def _sequence_reader(inner: str) -> _Reader:
     return read_sequence
 
 
-def _numbers_reader(code: str) -> _Reader:
+def _array_reader(code: str) -> _Reader:
     size = struct.calcsize(f"<{code}")
 
-    def read_numbers(content: bytes, at: int) -> tuple[Any, int]:
+    def read_array(content: bytes, at: int) -> tuple[Any, int]:
         at += -at % 4
         (count,) = _LENGTH(content, at)
         at += 4
@@ -187,7 +215,7 @@ def _numbers_reader(code: str) -> _Reader:
             return [byte != 0 for byte in content[at:end]], end
         return array(code, content[at:end]), end
 
-    return read_numbers
+    return read_array
 
 
 # --- writing ----------------------------------------------------------------------------------

@@ -293,6 +293,8 @@ class ControlClient:
 
     def expire(self, now: float) -> None:
         """End the calls whose deadline has passed."""
+        if not self._calls:
+            return
         for call in [call for call in self._calls if now >= call.deadline]:
             self._calls.remove(call)
             call.client.remove_pending_request(call.future)

@@ -8,7 +8,6 @@ receivers are signed, in a `rosrm_msgs/Signed`, and not encrypted.
 
 from __future__ import annotations
 
-import struct
 from array import array
 from collections.abc import Callable
 from typing import Any, Final, Generic, TypeVar
@@ -24,7 +23,7 @@ from rosrm.keys.roles import may_send
 from rosrm.keys.sealing import FORMAT, RUN_BYTES, channel_of
 from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
 from rosrm.keys.tickets import Ticket
-from rosrm.ros import cdr, qos
+from rosrm.ros import cdr, qos, signed_codec
 from rosrm.ros.bounds import check_bounds
 from rosrm.ros.participant import OpenRequest, Participant, failed_response
 from rosrm.ros.sealed_codec import MOST_LETTERS, Envelope, decode, encode
@@ -106,12 +105,6 @@ def _plain(kind: Any, content: bytes) -> Any:
         raise Refused(f"a malformed {kind.__name__}: {fault}") from None
     check_bounds(message)
     return message
-
-
-def _signed_content(channel: bytes, message: msg.Signed) -> bytes:
-    """Return the bytes that a signature covers."""
-    counter = struct.pack("<Q", message.counter)
-    return channel + bytes(message.run) + counter + bytes(message.body)
 
 
 class SealedRequest:
@@ -285,25 +278,23 @@ class SealedEndpoints(Generic[SecurityT]):
         channel = topic_channel(message_type, name)
         newest: dict[bytes, int] = {}
 
-        def check_and_take(message: msg.Signed) -> None:
-            run, signature = bytes(message.run), bytes(message.signature)
-            if message.counter <= newest.get(run, 0):
+        def check_and_take(data: bytes) -> None:
+            message = signed_codec.decode(data)
+            if message is not None and message.counter <= newest.get(message.run, 0):
                 return  # before the signature, whose check takes longer than all else
-            if (
-                message.format != FORMAT
-                or (len(run), len(signature)) != (RUN_BYTES, SIGNATURE_BYTES)
-                or not self.security.is_signed(_signed_content(channel, message), signature)
+            if message is None or not self.security.is_signed(
+                message.content(channel), message.signature
             ):
                 self.refused(name)
                 return
-            newest.pop(run, None)  # so that the run that sends is forgotten last
-            newest[run] = message.counter
+            newest.pop(message.run, None)  # so that the run that sends is forgotten last
+            newest[message.run] = message.counter
             if len(newest) > _MOST_RUNS:
                 del newest[next(iter(newest))]
-            take(_plain(message_type, bytes(message.body)), run)
+            take(_plain(message_type, message.body), message.run)
 
         return self.participant.node.create_subscription(
-            msg.Signed, name, self.participant.counted(check_and_take), profile
+            msg.Signed, name, self.participant.counted(check_and_take), profile, raw=True
         )
 
 
@@ -367,13 +358,15 @@ class SignedPublisher:
     def publish(self, message: Any) -> None:
         """Send a message."""
         self._counter += 1
-        signed = msg.Signed(
-            format=FORMAT, run=array("B", self._security.run), counter=self._counter,
-            body=array("B", serialize_message(message)),
+        run, body = self._security.run, serialize_message(message)
+        content = signed_codec.signed_content(self._channel, run, self._counter, body)
+        signature = self._security.signature(content).ljust(SIGNATURE_BYTES, b"\0")
+        self._publisher.publish(
+            msg.Signed(
+                format=FORMAT, run=array("B", run), counter=self._counter,
+                signature=array("B", signature), body=array("B", body),
+            )
         )  # fmt: skip
-        signature = self._security.signature(_signed_content(self._channel, signed))
-        signed.signature = array("B", signature.ljust(SIGNATURE_BYTES, b"\0"))
-        self._publisher.publish(signed)
 
 
 class SealedClient:

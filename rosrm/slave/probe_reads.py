@@ -41,10 +41,10 @@ def read_values(probe: Probe, names: tuple[str, ...]) -> tuple[float, ...]:
             raise PluginError(f"two readings of {reading.resource!r}")
         usage = _fraction(reading)
         values[reading.resource] = usage
-    missing = [name for name in names if name not in values]
-    if missing:
+    if len(values) < len(names):
+        missing = [name for name in names if name not in values]
         raise PluginError(f"no reading of {', '.join(missing)}")
-    return tuple(values[name] for name in names)
+    return tuple(map(values.__getitem__, names))
 
 
 def _fraction(reading: Reading) -> float:

@@ -30,7 +30,7 @@ from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from queue import SimpleQueue
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.extensions.plugin_calls import with_place
@@ -96,8 +96,7 @@ class Sample:
     reports: tuple[ProbeReport, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class _Outcome:
+class _Outcome(NamedTuple):
     """Result of a read.
 
     Attributes:
@@ -163,15 +162,17 @@ class Sampler:
     def latest(self, now: float) -> Sample:
         """Return the newest readings, and queue a read of each probe that is due. Never waits."""
         reports: list[ProbeReport] = []
+        stale = 0
         for watched in self._watched:
             if watched.busy:
                 self._check_running_read(watched, now)
             elif watched.outcome is not None:
                 self._take_outcome(watched, watched.outcome)
-            reports += watched.report(now)
+            if watched.reason or watched.is_stale:
+                reports += watched.report(now)
+                stale |= watched.mask if watched.is_stale else 0
             if now >= watched.due and not watched.busy:
                 watched.lane.put(watched.prepare(now))
-        stale = sum(watched.mask for watched in self._watched if watched.is_stale)
         return Sample(array("f", self._usage), stale, tuple(reports))
 
     def settle(self, timeout: float) -> bool:
@@ -393,13 +394,13 @@ class _Watched:
     def _read(self) -> None:
         started = self._clock()
         self._started = started
-        values, reason = self._guarded("read", lambda: read_values(self._probe, self.names))
+        values, reason = self._guarded("read", read_values, self._probe, self.names)
         by_process: UsageByProcess | None = None
         if values is not None:
             by_process, reason = self._guarded(
-                "by_process", lambda: read_processes(self._probe, self._resources)
+                "by_process", read_processes, self._probe, self._resources
             )
-        devices, fault = self._guarded("devices", lambda: read_devices(self._probe))
+        devices, fault = self._guarded("devices", read_devices, self._probe)
         if by_process is None or values is None:
             values, by_process = (), EMPTY
         ended = self._clock()
@@ -407,12 +408,15 @@ class _Watched:
             values, by_process, devices, reason or fault, ended - started, ended - self.asked
         )
         self.busy = False
-        self._progress.set()
+        if not self._progress.is_set():  # `set` takes as long as a quick read
+            self._progress.set()
 
-    def _guarded(self, name: str, call: Callable[[], _T]) -> tuple[_T | None, str]:
+    def _guarded(
+        self, name: str, call: Callable[..., _T], *arguments: Any
+    ) -> tuple[_T | None, str]:
         """Return the result of a call of the probe, or None and why it failed."""
         try:
-            return call(), ""
+            return call(*arguments), ""
         except PluginError as nonsense:
             return None, with_place(nonsense, self._probe, name)
         except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even

@@ -100,7 +100,7 @@ class MachineCpu:
         """Return the busy seconds summed over all cores, and the elapsed seconds."""
         line = self._file.read().split(b"\n", 1)[0]
         # user nice system idle iowait irq softirq steal; guest time is part of user.
-        times = [int(field) for field in line.split()[1:9]]
+        times = [*map(int, line.split()[1:9])]
         idle = times[3] + times[4]
         total = sum(times)
         return (total - idle) / _TICKS, total / _TICKS / self.capacity

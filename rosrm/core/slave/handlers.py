@@ -503,6 +503,8 @@ def _may_be_discarded(state: SlaveState, held: HeldInstance, now: float) -> bool
 
 
 def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Commands:
+    if not state.held:  # so nothing runs or waits; ten times a second
+        return []
     orders: _Commands = [*fencing.renew_in_time(state, now), *_refuse_late(state, now)]
     orders += _report_waits(state, now)
     forgotten = []

@@ -257,7 +257,6 @@ def under_limits(usage: Sequence[float], limit: Sequence[float], present: int, s
         present, stale: bit i is slot i.
     """
     return all(
-        used < most and not stale >> slot & 1
-        for slot, (used, most) in enumerate(zip(usage, limit, strict=True))
-        if most < 1.0 and present >> slot & 1
+        most >= 1.0 or not present >> slot & 1 or (used < most and not stale >> slot & 1)
+        for slot, used, most in zip(range(present.bit_length()), usage, limit, strict=False)
     )

@@ -20,6 +20,7 @@ RESOLUTION: Final = 0.01
 
 #: Facts compared as one with the last message: accepting, processes, present, stale, statuses.
 _Facts = tuple[bool, int, int, int, int]
+_PRESENT: Final = 2
 
 
 class Reporter:
@@ -69,9 +70,10 @@ class Reporter:
         """Return True if a decision may differ between this reading and the last published one."""
         if self._facts != self._published or limit != self._published_limit:
             return True
+        slots = usage[: self._facts[_PRESENT].bit_length()]  # the usage of all others is 0
         return any(
             abs(now - before) >= RESOLUTION or (now >= most) != (before >= most)
-            for now, before, most in zip(usage, self._published_usage, limit, strict=True)
+            for now, before, most in zip(slots, self._published_usage, limit, strict=False)
         )
 
     def publish(self) -> None:

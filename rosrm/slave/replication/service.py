@@ -195,6 +195,8 @@ class ReplicationService:
     def tick(self, now: float) -> None:
         """Continue all work that is due; called several times a second."""
         self._endpoint.expire(now)
+        if now < self._next_scan and not (self._shipments or self._transfers or self._preparing):
+            return
         rate = float(self._settings.max_rate)
         self._budget = min(rate, self._budget + rate * (now - self._budget_at))
         self._budget_at = now

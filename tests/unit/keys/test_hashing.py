@@ -13,3 +13,10 @@ def test_a_digest_is_that_of_hashlib(content, key) -> None:
     """Parts of another version compute the same keys, tags and channels."""
     by_hashlib = hashlib.blake2b(content, digest_size=16, person=b"a use", key=key)
     assert digest_of(content, 16, b"a use", key) == by_hashlib.digest()
+
+
+@pytest.mark.parametrize(("size", "person", "key"), [(65, 16, 64), (16, 17, 64), (16, 16, 65)])
+def test_what_libsodium_cannot_use_raises(size, person, key) -> None:
+    """And nothing is read beyond the end of the person."""
+    with pytest.raises(ValueError, match="no BLAKE2b digest"):
+        digest_of(b"", size, bytes(person), bytes(key))

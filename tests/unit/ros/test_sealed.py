@@ -201,8 +201,12 @@ class Follower:
             msg.MasterBeat, BEATS, qos.BEAT_IN, lambda beat, _: self.taken.append(beat.beat)
         )
 
-    def create_subscription(self, _kind, _name, callback, _profile) -> None:
-        self.take = callback
+    def create_subscription(self, _kind, _name, callback, _profile, *, raw: bool) -> None:
+        assert raw
+        self.receive = callback
+
+    def take(self, message: msg.Signed) -> None:
+        self.receive(serialize_message(message))
 
     def is_signed(self, _content: bytes, _signature: bytes) -> bool:
         self.checked += 1
