@@ -3,9 +3,9 @@
 A lab of three hosts with addresses of their own: master and observer on one, and a counter that
 migrates to and fro between the two others (`rosrm_examples.portable_counter`, 50 Hz), with a heap
 of 10, 100 and 500 MB (--heaps). Blackout: from the last count received before a migration to the
-first one after it. After each migration the node reads its whole heap at least once. For comparison
-the same counter, with the first heap, migrates by `relaunch`, and one whose state is a number by
-`handoff`.
+first one after it. The node writes 1 % of its heap each second (--write), and
+reads the whole heap at least once after each migration. For comparison the same counter, with the
+first heap, migrates by `relaunch`, and one whose state is a number by `handoff`.
 
 Exit status: 1 if a migration failed, a cycle was executed twice, or a heap has changed. Needs root,
 and a CRIU that works.
@@ -47,6 +47,7 @@ _END: Final = 30.0
 _PARTS: Final = {
     "prepare": (("criu_checkpoint", "prepare"),),
     "dump": (("criu_checkpoint", "dump"),),
+    "compare": (("criu_checkpoint", "compare"),),
     "transfer": (("criu_checkpoint", "offer"), ("criu_fetch", "transfer")),
     "restore": (("criu_await_restored", "restore"),),
     "rejoin": (("criu_join", "join"),),
@@ -85,7 +86,7 @@ class Outcome:
     def part(self, name: str) -> list[float]:
         """Return the seconds of one part, for each migration."""
         return [
-            sum(hop["parts"][executor][word] for executor, word in _PARTS[name])
+            sum(hop["parts"][executor].get(word, 0.0) for executor, word in _PARTS[name])
             for hop in self.hops
             if hop["end"] == "migrated"
         ]
@@ -172,10 +173,10 @@ def play(lab: Lab, asked: Sequence[Mapping[str, Any]]) -> Iterator[dict[str, Any
         raise LabError(f"the client ended with exit code {code}; its errors are above")
 
 
-def measure(hops: int, heaps: Sequence[float]) -> list[dict[str, Any]]:
+def measure(hops: int, heaps: Sequence[float], write: float) -> list[dict[str, Any]]:
     """Return every hop, of every strategy."""
     asked: list[dict[str, Any]] = [
-        {"strategy": "criu", "mb": mb, "hops": number}
+        {"strategy": "criu", "mb": mb, "hops": number, "write": write}
         for mb, number in zip(heaps, shared(hops, heaps), strict=True)
     ]
     beside = min(_BESIDE, hops)
@@ -244,12 +245,16 @@ def main() -> int:
         "--heaps", type=_heap, nargs="+", default=[10.0, 100.0, 500.0], metavar="MB",
         help="MB of each heap; the figures outside of by_heap_mb are of the first",
     )  # fmt: skip
+    command_line.add_argument(
+        "--write", type=_share, default=0.01, metavar="SHARE",
+        help="of its heap that the node writes each second",
+    )  # fmt: skip
     chosen = command_line.parse_args()
     able = criu_support()
     if not able.works:
         say(f"CRIU does not work here: {able.reason}")
         return 2
-    hops = measure(max(1, chosen.hops), chosen.heaps)
+    hops = measure(max(1, chosen.hops), chosen.heaps, chosen.write)
     moved = [hop for hop in hops if hop["strategy"] == "criu"]
     outcomes = {
         f"{mb:g}": Outcome([hop for hop in moved if hop["mb"] == mb]) for mb in chosen.heaps
@@ -267,7 +272,8 @@ def main() -> int:
             "by_heap_mb": by_heap, "beside": others, "hops": len(moved),
             "failures": len(failures), "reasons": sorted(set(failures)),
             **{key: first[key] for key in ("blackout_p50_s", "blackout_p99_s", "rejoin_p50_s")},
-            "heap_ok": heap_ok, "repeated": repeated, "criu": able.facts.get("version", ""),
+            "heap_ok": heap_ok, "repeated": repeated, "write": chosen.write,
+            "criu": able.facts.get("version", ""),
         },
         runs=len(moved),
     )  # fmt: skip
@@ -282,6 +288,16 @@ def _heap(text: str) -> float:
     if not 0 < mb < 100_000:
         raise argparse.ArgumentTypeError(f"{text} is no number of MB above 0")
     return mb
+
+
+def _share(text: str) -> float:
+    try:
+        share = float(text)
+    except ValueError:
+        share = math.nan
+    if not 0 <= share <= 1:
+        raise argparse.ArgumentTypeError(f"{text} is no share from 0 to 1")
+    return share
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
 """Observer that migrates a counter to and fro, in the lab of `benchmarks.criu`.
 
-    python -m benchmarks.criu_desk '{"strategy": "criu", "mb": 10, "hops": 4}' ...
+    python -m benchmarks.criu_desk '{"strategy": "criu", "mb": 10, "hops": 4, "write": 0.01}' ...
 
 For each argument it starts a process, migrates it `hops` times, and ends it; `options` are those
-of the strategy. It prints one line of JSON for each hop: see `Hop`.
+of the strategy, and `write` is the share of the memory that the process writes each second. It
+prints one line of JSON for each hop: see `Hop`.
 """
 
 from __future__ import annotations
@@ -117,9 +118,11 @@ class MigrationDriver:
     def __init__(self, receiver: CountReceiver, client: MasterClient) -> None:
         self._receiver, self._client = receiver, client
 
-    def play(self, strategy: str, mb: float, hops: int, options: Mapping[str, Any]) -> None:
+    def play(
+        self, strategy: str, mb: float, hops: int, options: Mapping[str, Any], write: float
+    ) -> None:
         """Start a counter, migrate it to and fro, and end it."""
-        self._client.submit([_spec(strategy, mb, options)])
+        self._client.submit([_spec(strategy, mb, options, write)])
         self._wait("running")
         passes = 2 if strategy == "criu" else 0  # the second one began after the migration
         self._receiver.wait_for_counts(int(RATE * _SETTLE), passes)
@@ -188,8 +191,10 @@ class MigrationDriver:
             self._client.spin(0.05)
 
 
-def _spec(strategy: str, mb: float, options: Mapping[str, Any]) -> ProcessSpec:
+def _spec(strategy: str, mb: float, options: Mapping[str, Any], write: float) -> ProcessSpec:
     module, arguments = "rosrm_examples.portable_counter", f"--mb {mb:g} --period {1 / RATE:g}"
+    if write:
+        arguments += f" --write {write:g}"
     if strategy == "handoff":
         module, arguments = "benchmarks.handoff_nodes", f"count --rate {RATE:g}"
     return ProcessSpec(
@@ -208,7 +213,10 @@ def main() -> None:
     ):
         driver = MigrationDriver(receiver, client)
         for asked in map(json.loads, sys.argv[1:]):
-            driver.play(asked["strategy"], asked["mb"], asked["hops"], asked.get("options", {}))
+            driver.play(
+                asked["strategy"], asked["mb"], asked["hops"], asked.get("options", {}),
+                asked.get("write", 0.0),
+            )  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 """A counter that migrates with its whole memory, by CRIU: it publishes no state.
 
-    python -m rosrm_examples.portable_counter --mb 100 --period 0.02
+    python -m rosrm_examples.portable_counter --mb 100 --period 0.02 --write 0.01
 
 It holds MB of memory and publishes on `count` (std_msgs/Int64MultiArray) the count, 1, 2, 3, ...;
 the number of complete reads of its memory; and the CRC-32 of its content at the last one.
+With `--write` it also inverts its memory, a part at each count; the checksum is that of the bytes
+before.
 """
 
 from __future__ import annotations
@@ -13,7 +15,7 @@ import math
 import random
 import sys
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from std_msgs.msg import Int64MultiArray
 
@@ -21,6 +23,8 @@ from rosrm_criu.node import PortableNode, run_portable
 
 #: Bytes that are read at each count, so that no count takes long.
 SLICE = 4_000_000
+#: Each byte with all bits inverted, for `bytes.translate`.
+INVERTED = bytes(reversed(range(256)))
 
 
 class PortableCounter(PortableNode):
@@ -29,14 +33,17 @@ class PortableCounter(PortableNode):
     Args:
         mb: of memory, 1 MB = 10^6 bytes; the content is the same in each run.
         period: seconds between two counts.
+        write: share of the memory that is inverted each second.
     """
 
-    def __init__(self, mb: float = 1.0, period: float = 0.1) -> None:
+    def __init__(self, mb: float = 1.0, period: float = 0.1, write: float = 0.0) -> None:
         super().__init__("portable_counter")
         self.memory = filled(int(mb * 1e6))
         self.period = period
         self.count = self.passes = self.checksum = 0
         self.at = self.checksum_so_far = 0
+        self.write = write
+        self.written, self.inverts = 0, True
 
     def join(self) -> None:
         """Create the publisher and the timer, also after each migration."""
@@ -46,17 +53,35 @@ class PortableCounter(PortableNode):
     def tick(self) -> None:
         """Count, and publish."""
         self.read_on()
+        self.write_on(int(self.write * self.period * len(self.memory)))
         self.count += 1
         self.output.publish(Int64MultiArray(data=[self.count, self.passes, self.checksum]))
 
     def read_on(self) -> None:
         """Read the next slice of the memory."""
-        part = memoryview(self.memory)[self.at : self.at + SLICE]
-        self.checksum_so_far = zlib.crc32(part, self.checksum_so_far)
+        for part in self.original(self.at, self.at + SLICE):
+            self.checksum_so_far = zlib.crc32(part, self.checksum_so_far)
         self.at += SLICE
         if self.at >= len(self.memory):
             self.passes, self.checksum = self.passes + 1, self.checksum_so_far
             self.at = self.checksum_so_far = 0
+
+    def original(self, begin: int, end: int) -> Iterator[bytearray]:
+        """Yield a part of the memory with its first content; `written` splits the inverted part."""
+        for first, after, inverted in (
+            (begin, min(end, self.written), self.inverts),
+            (max(begin, self.written), end, not self.inverts),
+        ):
+            part = self.memory[first:after]
+            yield part.translate(INVERTED) if inverted else part
+
+    def write_on(self, size: int) -> None:
+        """Invert the next bytes of the memory."""
+        part = slice(self.written, self.written + size)
+        self.memory[part] = self.memory[part].translate(INVERTED)
+        self.written += size
+        if self.written >= len(self.memory):
+            self.written, self.inverts = 0, not self.inverts
 
 
 def filled(size: int) -> bytearray:
@@ -75,8 +100,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m rosrm_examples.portable_counter")
     parser.add_argument("--mb", type=_positive, default=1.0, help="MB of memory")
     parser.add_argument("--period", type=_positive, default=0.1, help="seconds between two counts")
+    parser.add_argument(
+        "--write", type=_positive, default=0.0, help="share of the memory to write each second"
+    )
     options = parser.parse_args(given[:at])
-    run_portable(lambda: PortableCounter(options.mb, options.period), args=given[at:])
+    run_portable(
+        lambda: PortableCounter(options.mb, options.period, options.write), args=given[at:]
+    )
 
 
 def _positive(text: str) -> float:

@@ -17,7 +17,15 @@ from rosrm.core.supervisor.events import StopOrdered
 from rosrm.errors import CriuError
 from rosrm.model.values import RestartPolicy
 from rosrm.supervisor.client_values import key_of
-from rosrm_criu.engine import dump, image, process_tree, restore, restore_result
+from rosrm_criu.engine import (
+    copied_pages,
+    dump,
+    image,
+    memory_copy,
+    process_tree,
+    restore,
+    restore_result,
+)
 from rosrm_criu.engine.image import MappedFile
 from tests.criu_kit import TIMEOUT, eventually
 from tests.integration.supervisor.conftest import Host
@@ -45,7 +53,45 @@ def counter(theatre):
     return actor
 
 
+#: Holds 8 MB, changes 200 bytes of it at SIGUSR1, and says the checksum at SIGUSR2.
+CHANGER = """
+import os, signal, zlib
+held, step = bytearray(range(256)) * (8_000_000 // 256), 40_000
+def change(*_):
+    for at in range(0, len(held), step):
+        held[at] ^= 0xFF
+    os.write(1, b"changed\\n")
+signal.signal(signal.SIGUSR1, change)
+signal.signal(signal.SIGUSR2, lambda *_: os.write(1, b"%d\\n" % zlib.crc32(held)))
+print("ready", flush=True)
+while True:
+    signal.pause()
+"""
+
+
 # --- what continues -----------------------------------------------------------------------------
+
+
+def test_a_process_is_restored_from_a_copy_and_its_later_changes(theatre):
+    """CRIU reads pages that were equal in the dump from the copy, which was made before."""
+    actor = theatre.start(CHANGER)
+    actor.says("ready")
+    copy = memory_copy.copy([actor.pid], theatre.folder / "copy", TIMEOUT)
+    os.kill(actor.pid, signal.SIGUSR1)
+    actor.says("changed")
+    os.kill(actor.pid, signal.SIGUSR2)
+    eventually(actor.numbers, "a checksum")
+    directory = theatre.dump(actor)
+    sizes = copied_pages.leave_out(directory, copy)
+    changed = image.file_sizes(directory)
+    assert sum(size for name, size in changed.items() if "/pages-" in name) < 3_000_000
+    copied_pages.put_in_place(directory, copy.directory)
+    made = image.file_checksums(directory, (sizes := {**changed, **sizes}))
+    image.write(directory, replace(theatre.manifest, sizes=sizes, checksums=made))
+    restored = theatre.restore(directory)
+    os.kill(restored.outcome.pid, signal.SIGUSR2)
+    eventually(restored.numbers, "a checksum")
+    assert restored.numbers() == actor.numbers()
 
 
 def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):

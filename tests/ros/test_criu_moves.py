@@ -45,6 +45,24 @@ def test_a_node_counts_on_where_it_is_restored(criu, cluster, listener):
     nothing_left(cluster)
 
 
+def test_memory_that_is_written_during_its_copy_arrives_as_it_was_left(criu, cluster, listener):
+    """Twice, most of the memory comes from the copy that was sent before the node was frozen."""
+    cluster.submit(counter("--mb", "100", "--period", "0.02", "--write", "0.05"))
+    cluster.wait(NAME, "running")
+    listener.receive(50)
+    for times in (1, 2):
+        before = cluster.client.list().last_sequence
+        assert not ask(cluster)
+        moved(cluster, times)
+        event = cluster.wait_for_event("migrated", process=NAME, after=before)
+        assert "compare" in event.facts["parts"]["criu_checkpoint"], "the whole dump was sent"
+        listener.receive(100)  # all its memory is read again within 50 counts
+    assert min(listener.steps()) == 1
+    assert len(listener.checksums) == 1
+    cluster.cancel(NAME)
+    nothing_left(cluster)
+
+
 def test_it_is_healthy_where_it_is_restored(criu, cluster, listener):
     """The health watch knows its topic, although the node has another pid in its namespace."""
     cluster.submit(counter(health=Health("count", rate=10.0, timeout=3.0)))

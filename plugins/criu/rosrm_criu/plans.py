@@ -27,8 +27,12 @@ from rosrm import (
 if TYPE_CHECKING:
     from rosrm_criu.options import CriuOptions
 
-#: Executors of a migration; see `executors/move.py`.
+#: Executors of a migration; see `executors/move.py`, and for its copy `executors/precopy.py`.
 HOST_CHECK: Final = "criu_host_check"
+MEASURE_MEMORY: Final = "criu_measure_memory"
+EXPECT_COPY: Final = "criu_expect_copy"
+COPY_MEMORY: Final = "criu_copy_memory"
+FETCH_COPY: Final = "criu_fetch_copy"
 INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
 GO_ON: Final = "criu_go_on"
@@ -91,10 +95,11 @@ def suspend(move: Move, seconds: float) -> SetRestart:
 
 
 def move_plan(move: Move, options: CriuOptions) -> Plan:
-    """Return a plan: freeze, dump, fetch, restore, commit, join, end the source.
+    """Return a plan: copy, freeze, dump, fetch, restore, commit, join, end the source.
 
-    The preparation of the destination and the fetch have no undo, because an undo would wait for a
-    host that may be lost, and the source would wait too. Both are cleaned up after a timeout.
+    The copy, the preparation of the destination and the fetch have no undo, because an undo would
+    wait for a host that may be lost, and the source would wait too. Each is cleaned up after a
+    timeout.
 
     Args:
         move: of a portable node, to another host.
@@ -110,6 +115,7 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
     return Plan(
         (
             suspend(move, start),
+            *_precopy(move, options, keep=until_dumped + options.transfer_timeout + 4 * start),
             execute(
                 move, there, INTRODUCE, start, keep=until_dumped + 2 * start,
                 working_directory=spec.working_directory,
@@ -134,6 +140,29 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
             execute(move, here, END, start),
             Stop(move.source, here, spec.stop.timeout),
         )
+    )  # fmt: skip
+
+
+def _precopy(move: Move, options: CriuOptions, keep: float) -> tuple[Execute, ...]:
+    """Return the steps that copy the memory of the running node to the destination.
+
+    They succeed without a copy too: then the whole dump is sent.
+
+    Args:
+        move: of a portable node.
+        options: of the process.
+        keep: seconds after which an unused copy is removed.
+    """
+    here, there, start = move.source_host, move.destination_host, options.start_timeout
+    longest = options.transfer_timeout
+    return (
+        execute(move, here, MEASURE_MEMORY, start),
+        execute(move, there, EXPECT_COPY, start, keep=longest + 2 * start),
+        execute(
+            move, here, COPY_MEMORY, longest, offer=longest + start, keep=longest + keep,
+            max_rate=options.max_rate,
+        ),
+        execute(move, there, FETCH_COPY, longest, reserve=options.reserve, keep=keep),
     )  # fmt: skip
 
 

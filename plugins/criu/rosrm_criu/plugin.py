@@ -24,6 +24,10 @@ Executor = Callable[[Mapping[str, Any]], Mapping[str, Any]]
 #: Function of each step, below `rosrm_criu.executors`.
 EXECUTORS: Final = {
     plans.HOST_CHECK: "move.report_capability",
+    plans.MEASURE_MEMORY: "precopy.measure_memory",
+    plans.EXPECT_COPY: "precopy.expect_copy",
+    plans.COPY_MEMORY: "precopy.copy_memory",
+    plans.FETCH_COPY: "precopy.fetch_copy",
     plans.INTRODUCE: "move.introduce",
     plans.CHECKPOINT: "move.checkpoint",
     plans.GO_ON: "move.go_on",

@@ -15,12 +15,16 @@ from rosrm_criu.options import CriuOptions
 from rosrm_criu.plans import (
     AWAIT_RESTORED,
     CHECKPOINT,
+    COPY_MEMORY,
     END,
+    EXPECT_COPY,
     FETCH,
+    FETCH_COPY,
     GO_ON,
     HOST_CHECK,
     INTRODUCE,
     JOIN,
+    MEASURE_MEMORY,
 )
 from rosrm_criu.strategy import Criu
 from tests.unit.core.machine import Machine
@@ -69,6 +73,7 @@ class Portable(Machine):
             HOST_CHECK: lambda _: _ALIKE, INTRODUCE: lambda _: {}, FETCH: lambda _: {},
             CHECKPOINT: self._checkpoint, GO_ON: self._go_on, END: self._end_source,
             AWAIT_RESTORED: self._await_restored, JOIN: self._join,
+            **dict.fromkeys((MEASURE_MEMORY, EXPECT_COPY, COPY_MEMORY, FETCH_COPY), lambda _: {}),
         }  # fmt: skip
 
     def obey(self, sent: SendOrder, now: float) -> happened.OrderAnswered:

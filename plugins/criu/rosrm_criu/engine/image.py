@@ -1,7 +1,7 @@
 """Checkpoint image: a directory with everything that a restore needs, readable by its owner alone.
 
 manifest.json     description (see `Manifest`); written last: without it the image is incomplete
-criu/             CRIU's files
+criu/             CRIU's files; in `parent` memory that was sent before the dump
 files/            copies of the files that follow the process
 dump.log          CRIU's log of the dump; restore.log: of the restore
 hold.json         the result of the restore (see `rosrm_criu.engine.shim`)
@@ -31,6 +31,8 @@ _WITHOUT_CHECKSUMS: Final = 1
 MANIFEST: Final = "manifest.json"
 PAGES: Final = "criu"
 COPIES: Final = "files"
+#: Below CRIU's files of an image: pages that were sent before the dump.
+PARENT: Final = f"{PAGES}/parent"
 #: Exists during a restore: like `PAGES`, with the paths of this host.
 HERE: Final = f"{PAGES}.here"
 DUMP_LOG: Final = "dump.log"

@@ -23,6 +23,16 @@ def incoming(state: Path, number: int) -> Path:
     return state / "images" / f"in-{number}"
 
 
+def sent_copy(state: Path, number: int) -> Path:
+    """Return the path of the copy of an instance's memory that is sent before its dump."""
+    return state / "images" / f"copy-out-{number}"
+
+
+def received_copy(state: Path, number: int) -> Path:
+    """Return the path of the copy of the memory of the instance that will move here."""
+    return state / "images" / f"copy-in-{number}"
+
+
 def checkpoint(state: Path, number: int) -> Path:
     """Return the path of the checkpoint of an instance; the image stays there until the restore."""
     return state / "images" / f"kept-{number}"
@@ -38,7 +48,11 @@ def periodic(state: Path, number: int) -> Path:
     return state / "images" / f"periodic-{number}"
 
 
-def numbers(state: Path, kind: Literal["out", "in", "kept", "periodic"]) -> list[int]:
+#: First part of the names of the images of a kind.
+Kind = Literal["out", "in", "kept", "periodic", "copy-out", "copy-in"]
+
+
+def numbers(state: Path, kind: Kind) -> list[int]:
     """Return the numbers of the instances that have an image of a kind."""
     found = [path.name.removeprefix(f"{kind}-") for path in (state / "images").glob(f"{kind}-*")]
     return sorted(int(number) for number in found if number.isdigit())

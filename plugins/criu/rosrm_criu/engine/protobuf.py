@@ -77,6 +77,11 @@ def numbers(value: int | bytes) -> Iterator[int]:
         yield number
 
 
+def encoded_number(number: int, value: int) -> bytes:
+    """Return a field with a number as it is encoded."""
+    return _encoded(number << 3 | _NUMBER) + _encoded(value)
+
+
 def encoded_bytes(number: int, value: bytes) -> bytes:
     """Return a field of bytes as it is encoded."""
     return _encoded(number << 3 | _BYTES) + _encoded(len(value)) + value

@@ -72,7 +72,7 @@ def _check_names(directory: Path, manifest: Manifest) -> None:
     expected = {*manifest.sizes, image.MANIFEST, image.DUMP_LOG}
     for path in directory.rglob("*"):
         name = path.relative_to(directory).as_posix()
-        if name not in expected and name not in (image.PAGES, image.COPIES):
+        if name not in expected and name not in (image.PAGES, image.PARENT, image.COPIES):
             raise CriuError(f"the image holds {name!r}, which its manifest does not name: refused")
 
 

@@ -57,11 +57,9 @@ def images(directory: Path, old: str, new: str) -> Iterator[Path]:
         return
     beside = directory.with_name(HERE)
     shutil.rmtree(beside, ignore_errors=True)
-    beside.mkdir(mode=0o700)
     try:
-        for file in directory.iterdir():
-            if file.name != _FILES:
-                link_or_copy(file, beside / file.name)
+        shutil.copytree(directory, beside, copy_function=link_or_copy, ignore=lambda *_: (_FILES,))
+        beside.chmod(0o700)
         data = _files((directory / _FILES).read_bytes(), lambda path: moved(path, old, new))
         (beside / _FILES).write_bytes(data)
         yield beside

@@ -18,7 +18,7 @@ from rosrm.errors import CriuError
 Answer = Mapping[str, Any]
 
 #: Steps whose answers are kept; far more than there are migrations at a time.
-_REMEMBERED: Final = 50
+_REMEMBERED: Final = 100
 
 _changing: Final = threading.Lock()
 _flights: Final[dict[tuple[str, str], Future[Answer]]] = {}

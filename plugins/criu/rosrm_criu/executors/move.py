@@ -23,9 +23,10 @@ from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.messages import State, Status, read_message
 from rosrm_criu.engine import dump, process_tree, received
 from rosrm_criu.engine.binary import find
+from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.paths import incoming, outgoing
 from rosrm_criu.engine.probe import criu_support
-from rosrm_criu.executors import artifacts, attempts, periodic
+from rosrm_criu.executors import artifacts, attempts, periodic, precopy
 from rosrm_criu.executors.attempts import Answer
 from rosrm_criu.executors.checkpoint import reserve_all
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
@@ -42,6 +43,7 @@ def report_capability(arguments: Answer) -> Answer:
     here = arguments["here"]
     state = Path(here["state"])
     artifacts.sweep(state, here["instances"])
+    precopy.sweep(state)
     periodic.sweep(arguments)
     periodic.call_back_all(state, here["pids"])
     reserve_all(state)
@@ -93,7 +95,9 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         began = time.monotonic()
         left = leave(pid, control, asked.attempt, float(asked.arguments["seconds"]["leave"]))
         dumped = time.monotonic()
-        directory = _dump(pid, asked)
+        directory, manifest = _dump(pid, asked)
+        compared = time.monotonic()
+        is_partial = precopy.leave_out_copied(asked, directory, manifest)
         offered = time.monotonic()
         offer = _offer(sender, directory, asked)
     except Exception:  # any error: the node rejoins
@@ -102,10 +106,13 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         finally:  # afterwards, because the end of the sender takes a while
             artifacts.withdraw(asked.state, asked.source)
         raise
+    finally:  # in the background, because the node is frozen
+        artifacts.later(0.0, precopy.forget_sent, asked.state, asked.source)
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
         "seconds": {
-            "prepare": dumped - began, "leave": left, "dump": offered - dumped,
+            "prepare": dumped - began, "leave": left, "dump": compared - dumped,
+            **({"compare": offered - compared} if is_partial else {}),
             "offer": time.monotonic() - offered,
         },
     }  # fmt: skip
@@ -150,17 +157,17 @@ def end(arguments: Answer) -> Answer:
     return {}
 
 
-def _dump(pid: int, asked: StepArguments) -> Path:
+def _dump(pid: int, asked: StepArguments) -> tuple[Path, Manifest]:
     directory = outgoing(asked.state, asked.source)
     artifacts.discard(directory)
     attempts.check_wanted(asked.attempt)
     with without_log_names():
-        dump.dump(
+        manifest = dump.dump(
             find(), pid, directory, leave="stopped",
             timeout=float(asked.arguments["seconds"]["dump"]),
             process=asked.process, instance=asked.source, checksums=False,
         )  # fmt: skip
-    return directory
+    return directory, manifest
 
 
 def _offer(sender: Sender, directory: Path, asked: StepArguments) -> Offer:
@@ -186,7 +193,7 @@ def introduce(arguments: Answer) -> Answer:
     if named and not Path(named).expanduser().is_dir():
         raise CriuError(f"its working directory {named} does not exist on {asked.host}: make it")
     certificate = artifacts.open_fetcher(asked.destination, float(arguments["keep"]))
-    return {"certificate": certificate}
+    return {"certificate": certificate, "copy": precopy.received(asked)}
 
 
 def fetch_image(arguments: Answer) -> Answer:
@@ -215,6 +222,7 @@ def _fetch(asked: StepArguments) -> Answer:
             Offer.from_json(dumped["offer"]), directory, timeout=asked.timeout,
             reserve=int(asked.arguments["reserve"]),
         )  # fmt: skip
+        precopy.put_in_place(asked, directory)
         _check_received(asked, directory, uid)
     finally:
         artifacts.close_soon(fetcher)

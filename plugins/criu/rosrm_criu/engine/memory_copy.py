@@ -1,0 +1,150 @@
+"""Copy of the memory of running processes, made before they are stopped for their dump.
+
+The processes write to their memory during the copy, so a page of the copy may never have existed in
+this form. Therefore `copied_pages` uses only pages that are equal to those of the later dump.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from rosrm.errors import CriuError
+from rosrm.supervisor.procfs import inner_pid
+
+PAGE: Final = mmap.PAGESIZE
+#: Areas with less anonymous memory are not copied, because each one costs time in the dump.
+_LEAST: Final = 256 << 10
+#: Bytes per read of memory, and of address space whose pages are looked up at once.
+_PIECE: Final = 1 << 20
+_SPAN: Final = 1 << 28
+#: Bits of an entry in /proc/PID/pagemap: in memory, swapped, and of a file or shared.
+_HELD: Final = np.uint64(0b11 << 62)
+_OF_FILE: Final = np.uint64(1 << 61)
+#: First line of an area in /proc/PID/smaps.
+_AREA: Final = re.compile(r"([0-9a-f]+)-([0-9a-f]+) ")
+
+
+class Run(NamedTuple):
+    """Adjacent pages.
+
+    Attributes:
+        begin: address of the first page.
+        pages: number of pages.
+    """
+
+    begin: int
+    pages: int
+
+    @property
+    def end(self) -> int:
+        """Return the address after the last page."""
+        return self.begin + self.pages * PAGE
+
+
+@dataclass(frozen=True)
+class MemoryCopy:
+    """Copied pages of processes.
+
+    Attributes:
+        directory: contains the file `file_name(pid)` of each process, with its pages in order.
+        runs: the pages of each process, by its pid in its own namespace, by ascending address.
+    """
+
+    directory: Path
+    runs: Mapping[int, Sequence[Run]]
+
+
+def file_name(pid: int) -> str:
+    """Return the name of the file with the copied pages of a process."""
+    return f"pages-{pid}.img"
+
+
+def size_of(pids: Iterable[int]) -> int:
+    """Return the bytes that a copy of processes has; raise OSError if one has ended."""
+    return sum(anonymous for pid in pids for _, _, anonymous in _areas(pid))
+
+
+def copy(pids: Iterable[int], directory: Path, timeout: float) -> MemoryCopy:
+    """Copy the memory of running processes.
+
+    Args:
+        pids: of the processes.
+        directory: a new one.
+        timeout: seconds.
+
+    Raises:
+        CriuError: the copy took longer than `timeout`.
+        OSError: a process has ended, its memory may not be read, or the disk is full.
+    """
+    deadline = time.monotonic() + timeout
+    directory.mkdir(mode=0o700, parents=True)
+    return MemoryCopy(
+        directory, {inner_pid(pid): _copy_one(pid, directory, deadline) for pid in pids}
+    )
+
+
+def _copy_one(pid: int, directory: Path, deadline: float) -> list[Run]:
+    path = directory / file_name(inner_pid(pid))
+    path.touch(mode=0o600, exist_ok=False)
+    copied: list[Run] = []
+    with (
+        path.open("wb", buffering=0) as file,
+        Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory,
+        Path(f"/proc/{pid}/pagemap").open("rb", buffering=0) as pagemap,
+    ):
+        for begin, end, _ in _areas(pid):
+            for run in _held(pagemap.fileno(), begin, end):
+                size = 0
+                for piece in _pieces(memory.fileno(), run):
+                    if time.monotonic() > deadline:
+                        raise CriuError("the memory could not be copied in time")
+                    file.write(piece)
+                    size += len(piece)
+                if size:
+                    copied.append(Run(run.begin, size // PAGE))
+    return copied
+
+
+def _areas(pid: int) -> Iterator[tuple[int, int, int]]:
+    """Yield begin, end and anonymous bytes of the large areas of a process; raise OSError."""
+    begin = end = 0
+    for line in Path(f"/proc/{pid}/smaps").read_text(errors="replace").splitlines():
+        if found := _AREA.match(line):
+            begin, end = (int(number, 16) for number in found.groups())
+        elif line.startswith("Anonymous:") and (size := int(line.split()[1]) << 10) >= _LEAST:
+            yield begin, end, size
+
+
+def _held(pagemap: int, begin: int, end: int) -> Iterator[Run]:
+    """Yield the pages of an area that exist and are in no file."""
+    for start in range(begin, end, _SPAN):
+        size = (min(end, start + _SPAN) - start) // PAGE * 8
+        entries = np.frombuffer(os.pread(pagemap, size, start // PAGE * 8), np.uint64)
+        held = ((entries & _HELD) != 0) & ((entries & _OF_FILE) == 0)
+        edges = np.flatnonzero(np.diff(held, prepend=False, append=False)).tolist()
+        for first, after in zip(edges[::2], edges[1::2], strict=True):
+            yield Run(start + first * PAGE, after - first)
+
+
+def _pieces(memory: int, run: Run) -> Iterator[bytes]:
+    """Yield whole pages from the beginning of a run, up to one that has been unmapped since."""
+    at = run.begin
+    while at < run.end:
+        try:
+            piece = os.pread(memory, min(_PIECE, run.end - at), at)
+        except OSError:
+            return
+        piece = piece[: len(piece) // PAGE * PAGE]
+        if not piece:
+            return
+        yield piece
+        at += len(piece)

@@ -1,0 +1,245 @@
+"""Executors that copy the memory of a running node to the destination, before a move freezes it.
+
+The dump of the frozen node then sends only the pages that differ. Every failure here means that the
+whole dump is sent, so an executor never raises: its answer names the reason.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from rosrm.errors import CriuError
+from rosrm_criu.engine import copied_pages, image, memory_copy, process_tree
+from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine.memory_copy import MemoryCopy
+from rosrm_criu.engine.paths import numbers, received_copy, sent_copy
+from rosrm_criu.executors import artifacts, attempts
+from rosrm_criu.executors.attempts import Answer
+from rosrm_criu.executors.request import StepArguments
+from rosrm_criu.plans import COPY_MEMORY, EXPECT_COPY, FETCH_COPY, INTRODUCE, MEASURE_MEMORY
+from rosrm_criu.transfer import Offer, Sender
+
+#: Bytes of the least memory that is copied; less is dumped, sent and restored in a second.
+LEAST: Final = 64 << 20
+
+
+@dataclass(frozen=True)
+class _Sent:
+    """Copy at the source.
+
+    Attributes:
+        copy: its files and pages.
+        offer: fingerprint of its offer.
+        sender: its sending end.
+    """
+
+    copy: MemoryCopy
+    offer: str
+    sender: Sender
+
+
+_changing: Final = threading.Lock()
+_sent: Final[dict[int, _Sent]] = {}
+#: Fingerprint of the offer of each received copy, by the number of the future instance.
+_received: Final[dict[int, str]] = {}
+
+
+#: A step with parsed arguments, and the executor of it.
+_Work = Callable[[StepArguments], Answer]
+_Executor = Callable[[Answer], Answer]
+
+
+def _optional(step: str) -> Callable[[_Work], _Executor]:
+    """Return a decorator for an executor that runs once per attempt and answers with its error."""
+
+    def decorate(work: _Work) -> _Executor:
+        def attempt(asked: StepArguments) -> Answer:
+            try:
+                return work(asked)
+            except Exception as error:  # noqa: BLE001 - after any error the whole dump is sent
+                return {"skipped": str(error)}
+
+        @functools.wraps(work)
+        def executor(arguments: Answer) -> Answer:
+            asked = StepArguments.of(arguments)
+            return attempts.once(step, asked.attempt, lambda: attempt(asked))
+
+        return executor
+
+    return decorate
+
+
+# --- the source -------------------------------------------------------------------------------
+
+
+@_optional(MEASURE_MEMORY)
+def measure_memory(asked: StepArguments) -> Answer:
+    """Return the bytes to copy; 0: too few, or there is no room for a copy and the dump."""
+    pids = _pids(asked)
+    size = memory_copy.size_of(pids)
+    if size < LEAST:
+        return {"bytes": 0}
+    folder = sent_copy(asked.state, asked.source).parent
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    image.check_room(folder, size + process_tree.memory_of(pids))
+    return {"bytes": size}
+
+
+@_optional(COPY_MEMORY)
+def copy_memory(asked: StepArguments) -> Answer:
+    """Copy the memory of the running node, and offer the copy."""
+    to = asked.results[EXPECT_COPY].get("certificate")
+    if not to:
+        return {}
+    forget_sent(asked.state, asked.source)
+    directory = sent_copy(asked.state, asked.source)
+    sender = Sender()
+    try:
+        # The other half is for the start of the offer; the step itself must not time out.
+        copy = memory_copy.copy(_pids(asked), directory, asked.timeout / 2)
+        offer = sender.offer(
+            directory, seconds=float(asked.arguments["offer"]), to=str(to),
+            max_rate=float(asked.arguments["max_rate"]),
+        )  # fmt: skip
+    except BaseException:  # any error: no other code would close this end
+        sender.close()
+        artifacts.discard(directory)
+        raise
+    sent = _Sent(copy, offer.fingerprint, sender)
+    with _changing:
+        _sent[asked.source] = sent
+    artifacts.later(float(asked.arguments["keep"]), forget_sent, asked.state, asked.source, sent)
+    return {"offer": offer.as_json()}
+
+
+def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) -> bool:
+    """Remove the pages from a dump that the destination has received as a copy.
+
+    Args:
+        asked: arguments of the step.
+        directory: of the image.
+        manifest: of the image.
+
+    Returns:
+        True if the dump now refers to the copy; False: it is as before.
+    """
+    with _changing:
+        sent = _sent.get(asked.source)
+    if sent is None or sent.offer != asked.results[INTRODUCE].get("copy"):
+        return False
+    try:
+        copied = copied_pages.leave_out(directory, sent.copy)
+    except (OSError, ValueError, KeyError):  # the whole dump is sent
+        return False
+    sizes = {**image.file_sizes(directory), **copied}
+    image.write(directory, replace(manifest, sizes=sizes))
+    return True
+
+
+def forget_sent(state: Path, number: int, only: _Sent | None = None) -> None:
+    """Remove the copy of an instance at the source.
+
+    Args:
+        state: directory of the slave.
+        number: of the instance.
+        only: the copy to remove; None: any.
+    """
+    with _changing:
+        sent = _sent.get(number)
+        if only not in (None, sent):
+            return
+        _sent.pop(number, None)
+        artifacts.discard(sent_copy(state, number))
+    if sent is not None:
+        sent.sender.close()
+
+
+def _pids(asked: StepArguments) -> Sequence[int]:
+    return process_tree.tree(process_tree.root_of(asked.leader(asked.source)))
+
+
+# --- the destination --------------------------------------------------------------------------
+
+
+@_optional(EXPECT_COPY)
+def expect_copy(asked: StepArguments) -> Answer:
+    """Prepare the fetch of the copy, if there will be one."""
+    if not asked.results[MEASURE_MEMORY].get("bytes"):
+        return {}
+    keep = float(asked.arguments["keep"])
+    return {"certificate": artifacts.open_fetcher(asked.destination, keep)}
+
+
+@_optional(FETCH_COPY)
+def fetch_copy(asked: StepArguments) -> Answer:
+    """Fetch the copy, if there is room for the whole dump beside it."""
+    if "offer" not in asked.results[COPY_MEMORY]:
+        return {}
+    offer = Offer.from_json(asked.results[COPY_MEMORY]["offer"])
+    directory = received_copy(asked.state, asked.destination)
+    forget_received(asked.state, asked.destination)
+    fetcher = artifacts.take_fetcher(asked.destination)
+    if fetcher is None:
+        raise CriuError("the slave was started again since the copy was offered")
+    try:
+        reserve = int(asked.arguments["reserve"]) + offer.size
+        fetched = fetcher.fetch(offer, directory, timeout=asked.timeout, reserve=reserve)
+    finally:
+        artifacts.close_soon(fetcher)
+    if not copied_pages.are_copies(directory):
+        artifacts.discard(directory)
+        raise CriuError("the copy holds other files than pages: refused")
+    with _changing:
+        _received[asked.destination] = offer.fingerprint
+    keep = float(asked.arguments["keep"])
+    artifacts.later(keep, forget_received, asked.state, asked.destination, offer.fingerprint)
+    return {"seconds": {"transfer": fetched.seconds}, "received": fetched.received}
+
+
+def received(asked: StepArguments) -> str:
+    """Return the fingerprint of the offer of the received copy; "": there is none."""
+    with _changing:
+        is_here = received_copy(asked.state, asked.destination).is_dir()
+        return _received.get(asked.destination, "") if is_here else ""
+
+
+def put_in_place(asked: StepArguments, directory: Path) -> None:
+    """Add the received copy to a received image that refers to it; remove it otherwise."""
+    with contextlib.suppress(OSError):  # the check of the image names a file that is missing
+        copied_pages.put_in_place(directory, received_copy(asked.state, asked.destination))
+    forget_received(asked.state, asked.destination)
+
+
+def forget_received(state: Path, number: int, only: str = "") -> None:
+    """Remove the copy for an instance at the destination.
+
+    Args:
+        state: directory of the slave.
+        number: of the instance.
+        only: fingerprint of the offer of the copy to remove; "": any.
+    """
+    with _changing:
+        if only and _received.get(number) != only:
+            return
+        _received.pop(number, None)
+    artifacts.discard(received_copy(state, number))
+
+
+# --- both -------------------------------------------------------------------------------------
+
+
+def sweep(state: Path) -> None:
+    """Remove the copies of a former slave of this host."""
+    with _changing:
+        for number in numbers(state, "copy-out"):
+            if number not in _sent:
+                artifacts.discard(sent_copy(state, number))
+        for number in numbers(state, "copy-in"):
+            if number not in _received:
+                artifacts.discard(received_copy(state, number))

@@ -1,0 +1,168 @@
+"""Pages of a dump that were copied before are left out, and are restored from the copy."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from rosrm.errors import CriuError
+from rosrm_criu.engine import copied_pages, memory_copy, protobuf
+from rosrm_criu.engine.copied_pages import Entry, Pagemap
+from rosrm_criu.engine.image import PAGES, PARENT
+from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, Run, file_name
+
+PID = 7
+IN_PARENT, PRESENT = 1, 4
+#: Beginning of a pagemap of CRIU 4.2.1: the pages are in file 1, and its first page.
+SAMPLE = bytes.fromhex("1943565425400856 020000000801 0e0000000880c0f1b3bcb715100020042801")
+#: Contents by number of the page, of one process.
+memories = st.dictionaries(st.integers(0, 200), st.integers(0, 2), max_size=150)
+FULL = dict.fromkeys(range(200), 1)
+
+
+def content(number: int) -> bytes:
+    """Return a page; two different ones differ in their last byte alone."""
+    return bytes(PAGE - 1) + bytes([number])
+
+
+def runs_of(memory: dict[int, int]) -> list[Run]:
+    """Return the pages of a memory as the longest possible runs."""
+    runs: list[Run] = []
+    for page in sorted(memory):
+        if runs and runs[-1].end == page * PAGE:
+            runs[-1] = Run(runs[-1].begin, runs[-1].pages + 1)
+        else:
+            runs.append(Run(page * PAGE, 1))
+    return runs
+
+
+def write_pages(path: Path, memory: dict[int, int]) -> None:
+    path.write_bytes(b"".join(content(memory[page]) for page in sorted(memory)))
+
+
+def dump_after_copy(folder: Path, before: dict[int, int], after: dict[int, int]) -> MemoryCopy:
+    """Write the image of a memory, and a copy of it at an earlier time; return the copy."""
+    images, copies = folder / PAGES, folder / "copies"
+    images.mkdir()
+    copies.mkdir()
+    pagemap = Pagemap(SAMPLE[: protobuf.MAGIC], 1, [Entry(run, PRESENT) for run in runs_of(after)])
+    (images / f"pagemap-{PID}.img").write_bytes(pagemap.encoded())
+    write_pages(images / "pages-1.img", after)
+    write_pages(copies / file_name(PID), before)
+    return MemoryCopy(copies, {PID: runs_of(before)})
+
+
+def restored(images: Path) -> dict[int, bytes]:
+    """Return the pages of an image as CRIU reads them: marked ones from the parent."""
+    head, *entries = protobuf.messages((images / f"pagemap-{PID}.img").read_bytes())
+    (number,) = (one.value for one in protobuf.fields(head))
+    pages = (images / f"pages-{number}.img").read_bytes()
+    found: dict[int, bytes] = {}
+    for entry in entries:
+        values = {one.number: int(one.value) for one in protobuf.fields(entry)}
+        for page in range(values[1] // PAGE, values[1] // PAGE + values[5]):
+            if values[4] == IN_PARENT:
+                found[page] = restored(images / "parent")[page]
+            else:
+                found[page], pages = pages[:PAGE], pages[PAGE:]
+    assert not pages
+    return found
+
+
+@given(memories, memories)
+@example(FULL, FULL)
+@example(FULL, {**FULL, 3: 2, 64: 2})
+def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before, after):
+    """Whatever was mapped, unmapped or written since the copy, and no equal page is sent again."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        copy = dump_after_copy(folder, before, after)
+        sizes = copied_pages.leave_out(folder, copy)
+        sent = (folder / PAGES / "pages-1.img").stat().st_size // PAGE
+        copied_pages.put_in_place(folder, copy.directory)
+        expected = {page: content(number) for page, number in after.items()}
+        if before:
+            assert restored(folder / PAGES) == expected
+            assert sent == sum(before.get(page) != number for page, number in after.items())
+            assert sizes == {f"{PARENT}/{file_name(PID)}": len(before) * PAGE}
+        else:
+            assert sent == len(after)
+            assert sizes == {}
+
+
+def test_the_format_is_that_of_criu():
+    """A pagemap that CRIU wrote is written again as the same bytes."""
+    found = Pagemap.decoded(SAMPLE)
+    assert (found.file, [run.pages for run, _ in found.entries]) == (1, [1])
+    assert found.encoded() == SAMPLE
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda data: data.replace(b"\x20\x04", b"\x20\x0c"),  # an unknown flag
+        lambda data: data.replace(b"\x20\x04", b"\x38\x04"),  # an unknown field
+        lambda data: data.replace(b"\x28\x01", b"\x28\x02"),  # more pages than the file has
+        lambda data: data[:-1],
+    ],
+)
+def test_a_dump_of_an_unknown_form_stays_as_it_is(tmp_path, change):
+    """The whole dump can be sent then."""
+    copy = dump_after_copy(tmp_path, {5: 1}, {5: 1})
+    pagemap = tmp_path / PAGES / f"pagemap-{PID}.img"
+    pagemap.write_bytes(change(pagemap.read_bytes()))
+    before = {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()}
+    with pytest.raises((ValueError, KeyError)):
+        copied_pages.leave_out(tmp_path, copy)
+    assert {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()} == before
+
+
+# --- the copy ---------------------------------------------------------------------------------
+
+#: Maps 1 MiB of ones and 1 MiB that it never touches, and tells where.
+HOLDER = """
+import ctypes, mmap, sys
+area = mmap.mmap(-1, 1 << 21, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+area[:1 << 20] = bytes([1]) * (1 << 20)
+print(ctypes.addressof(ctypes.c_char.from_buffer(area)), flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder():
+    """Yield a process that holds memory; it ends with its input."""
+    with subprocess.Popen(
+        [sys.executable, "-I", "-S", "-c", HOLDER], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        yield process
+
+
+def test_the_memory_of_a_running_process_is_copied(tmp_path, holder):
+    """Its pages are in the file in order, without those that it never touched."""
+    begin = int(holder.stdout.readline())
+    copy = memory_copy.copy([holder.pid], tmp_path / "copy", 60.0)
+    file = copy.directory / file_name(holder.pid)
+    found, at, data = {}, 0, file.read_bytes()
+    for run in copy.runs[holder.pid]:
+        for page in range(run.pages):
+            found[run.begin + page * PAGE] = data[at : at + PAGE]
+            at += PAGE
+    assert at == len(data) <= memory_copy.size_of([holder.pid])
+    assert all(found[begin + offset] == b"\1" * PAGE for offset in range(0, 1 << 20, PAGE))
+    assert not any(begin + offset in found for offset in range(1 << 20, 1 << 21, PAGE))
+    assert copy.directory.stat().st_mode & 0o777 == 0o700
+    assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_copy_has_a_timeout(tmp_path, holder):
+    """A process with much memory on a slow disk does not hold up its move."""
+    assert holder.stdout.readline()
+    with pytest.raises(CriuError, match="in time"):
+        memory_copy.copy([holder.pid], tmp_path / "copy", 0.0)

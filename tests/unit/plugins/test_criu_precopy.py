@@ -1,0 +1,188 @@
+"""Steps of a move by criu that copy the memory of the running node; none of them fails a move."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+from itertools import count
+
+import pytest
+
+from rosrm_criu.engine.memory_copy import file_name
+from rosrm_criu.engine.paths import received_copy, sent_copy
+from rosrm_criu.executors import artifacts, precopy
+from rosrm_criu.executors.request import StepArguments
+from rosrm_criu.plans import COPY_MEMORY, EXPECT_COPY, FETCH_COPY, MEASURE_MEMORY
+from rosrm_criu.transfer import Sender, missing
+from tests.waiting import PATIENCE, wait_until
+
+pytestmark = pytest.mark.skipif(bool(missing()), reason=missing() or "-")
+
+_numbers = count(1)
+HOLDER = (
+    "import sys; held = bytearray(b'1') * int(sys.argv[1]); print(flush=True); sys.stdin.read()"
+)
+
+
+class Steps:
+    """Calls of the executors for one move, with the results of the former ones.
+
+    Args:
+        folder: of source and destination.
+        size: bytes of the memory of the process that moves.
+    """
+
+    def __init__(self, folder, size: int = 2 * precopy.LEAST) -> None:
+        self.folder, self.number = folder, next(_numbers)
+        self.results: dict[str, object] = {}
+        self.process = subprocess.Popen(
+            [sys.executable, "-I", "-S", "-c", HOLDER, str(size)], stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        )  # fmt: skip
+        assert self.process.stdout.readline()
+
+    def arguments(self, **changes):
+        here = {
+            "host": "h", "state": str(self.folder), "pids": {f"p#{self.number}": self.process.pid},
+            "instances": [], "options": {},
+        }  # fmt: skip
+        return {
+            "process": "p", "source": self.number, "destination": self.number,
+            "attempt": f"p#{self.number}", "timeout": PATIENCE, "here": here, "keep": 600.0,
+            "offer": 60.0, "max_rate": 0, "reserve": 0, "results": self.results, **changes,
+        }  # fmt: skip
+
+    def call(self, name: str, step, **changes):
+        self.results[name] = step(self.arguments(**changes))
+        return self.results[name]
+
+    def until_offered(self) -> None:
+        self.call(MEASURE_MEMORY, precopy.measure_memory)
+        self.call(EXPECT_COPY, precopy.expect_copy)
+        self.call(COPY_MEMORY, precopy.copy_memory)
+
+    def fetch(self, **changes):
+        return self.call(FETCH_COPY, precopy.fetch_copy, **changes)
+
+    @property
+    def received(self) -> str:
+        return precopy.received(StepArguments.of(self.arguments()))
+
+    @property
+    def there(self):
+        return received_copy(self.folder, self.number)
+
+    def close(self) -> None:
+        precopy.forget_sent(self.folder, self.number)
+        precopy.forget_received(self.folder, self.number)
+        if fetcher := artifacts.take_fetcher(self.number):
+            fetcher.close()
+        self.process.communicate()
+
+
+@pytest.fixture
+def steps(tmp_path):
+    one = Steps(tmp_path)
+    yield one
+    one.close()
+
+
+def test_a_copy_is_at_the_destination_before_the_dump(steps):
+    """The destination names the offer of its copy, and a sweep by the same slave keeps the copy."""
+    steps.until_offered()
+    answer = steps.fetch()
+    assert answer["received"] > 0
+    assert steps.received == steps.results[COPY_MEMORY]["offer"]["fingerprint"]
+    precopy.sweep(steps.folder)
+    assert [path.name for path in steps.there.iterdir()] == [file_name(steps.process.pid)]
+
+
+def test_little_memory_is_not_copied(tmp_path):
+    """No process is started for it, and nothing is written."""
+    steps = Steps(tmp_path, size=1 << 20)
+    steps.until_offered()
+    assert steps.results == {MEASURE_MEMORY: {"bytes": 0}, EXPECT_COPY: {}, COPY_MEMORY: {}}
+    assert steps.fetch() == {}
+    steps.close()
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_room_at_the_destination_is_no_failure(steps):
+    """The room has to hold the whole dump too, beside the reserve."""
+    steps.until_offered()
+    assert "do not fit beside" in steps.fetch(reserve=10**15)["skipped"]
+    assert steps.received == ""
+    assert not steps.there.exists()
+
+
+def test_a_process_that_has_ended_is_no_failure(steps):
+    """Its copy is left out, wherever the steps are."""
+    steps.call(MEASURE_MEMORY, precopy.measure_memory)
+    steps.call(EXPECT_COPY, precopy.expect_copy)
+    steps.process.communicate()
+    answer = steps.call(COPY_MEMORY, precopy.copy_memory)
+    assert f"p#{steps.number} does not run on h" in answer["skipped"]
+    assert steps.fetch() == {}
+    assert not sent_copy(steps.folder, steps.number).exists()
+
+
+def test_a_source_that_withdraws_its_copy_is_no_failure(steps):
+    """The destination keeps no part of it."""
+    steps.until_offered()
+    precopy.forget_sent(steps.folder, steps.number)
+    assert "cannot be reached" in steps.fetch()["skipped"]
+    assert steps.received == ""
+    assert not steps.there.exists()
+
+
+def test_a_copy_with_other_files_is_refused(steps, tmp_path):
+    """The destination would put them into an image."""
+    steps.until_offered()
+    strange = tmp_path / "strange"
+    strange.mkdir()
+    (strange / "core-1.img").write_bytes(b"registers")
+    with Sender() as sender:
+        to = steps.results[EXPECT_COPY]["certificate"]
+        offer = sender.offer(strange, seconds=60.0, to=to).as_json()
+        steps.results[COPY_MEMORY] = {"offer": offer}
+        assert "other files than pages" in steps.fetch()["skipped"]
+    assert not steps.there.exists()
+
+
+def test_a_repeated_step_gives_the_same_copy(steps):
+    """A restarted master asks again; the copy under way is the only one."""
+    steps.call(MEASURE_MEMORY, precopy.measure_memory)
+    steps.call(EXPECT_COPY, precopy.expect_copy)
+    answers = []
+    threads = [
+        threading.Thread(
+            target=lambda: answers.append(precopy.copy_memory(steps.arguments())), daemon=True
+        )
+        for _ in range(2)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(PATIENCE)
+    assert len(answers) == 2
+    assert answers[0] == answers[1]
+    assert "offer" in answers[0]
+
+
+def test_an_unused_copy_expires_at_both_ends(steps):
+    """A move that was given up leaves nothing."""
+    steps.call(MEASURE_MEMORY, precopy.measure_memory)
+    steps.call(EXPECT_COPY, precopy.expect_copy)
+    steps.call(COPY_MEMORY, precopy.copy_memory)
+    steps.fetch(keep=0.1)
+    wait_until(lambda: not steps.there.exists(), "the received copy is removed")
+    assert steps.received == ""
+
+
+def test_copies_of_a_former_slave_are_removed(tmp_path):
+    """No later step of it can use them."""
+    for place in (sent_copy(tmp_path, 1), received_copy(tmp_path, 1)):
+        place.mkdir(parents=True)
+    precopy.sweep(tmp_path)
+    assert not list((tmp_path / "images").iterdir())
