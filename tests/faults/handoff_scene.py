@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 from pathlib import Path
@@ -162,7 +163,8 @@ class Scene:
     def _send(self, victim: str, number: int) -> None:
         pid = self._pid_of(victim)
         assert pid > 1, f"there is no {victim}"
-        os.kill(pid, number)
+        with contextlib.suppress(ProcessLookupError):  # a released source may have ended already
+            os.kill(pid, number)
 
     def _host_of(self, victim: str) -> str:
         return self._host if victim.startswith("source") else _OTHER[self._host]
