@@ -24,6 +24,7 @@ from rosrm.node.handoff import source, stranded
 from rosrm.ros.qos import latched
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateConfig, StateMark, StatePart
+from tests.cpp import cpp_node
 from tests.ros.handoff_kit import fails, goes_on, is_gapless, numbers, shadowing
 from tests.ros.nodes import (
     ALIAS,
@@ -35,6 +36,7 @@ from tests.ros.nodes import (
     Counter,
     Counting,
     Server,
+    Serving,
     Stage,
     buffered,
     pair_of,
@@ -228,6 +230,19 @@ def test_a_source_closes_its_services_one_by_one(stage, monkeypatch):
     pair.conductor.hand_over()
     stage.spin_until(lambda: _servers(stage, "/counter/poke") == [ALIAS], "the successor's service")
     assert "counter" in _servers(stage, "/counter/get_parameters")
+
+
+def test_a_source_in_cpp_closes_its_services_one_by_one(stage, cpp_node_class, monkeypatch):
+    """Each service is closed in a callback of its own, because all peers process each closing."""
+    wakes, closed = [], []
+    wake, close = cpp_node._Core._wake, cpp_node._Service.close
+    monkeypatch.setattr(cpp_node._Core, "_wake", lambda core: (wakes.append(core), wake(core)))
+    monkeypatch.setattr(
+        cpp_node._Service, "close", lambda service: (closed.append(len(wakes)), close(service))
+    )
+    pair_of(stage, type("Server", (Serving, cpp_node_class), {})).conductor.hand_over()
+    stage.spin_until(lambda: len(closed) > 1, "two services closed")
+    assert len(set(closed)) == len(closed)
 
 
 def _servers(stage, name):

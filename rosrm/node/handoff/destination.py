@@ -41,7 +41,7 @@ _QUIET: Final = 0.2
 #: Seconds for which all readers have to be matched. A reader discovers a writer later than the
 #: writer discovers the reader: 0.4 s on a busy machine. After a lost announcement it waits until
 #: Fast DDS repeats the announcement. (With 0.5 s here, outputs came 1.3 to 1.9 s late in 5 of 200
-#: migrations beside other load.)
+#: migrations beside other load.) No event can replace this time (docs/decisions/0011).
 _MATCHED: Final = 1.5
 #: Seconds between two checks of the conditions that a shadow waits for.
 _REVIEW: Final = 0.1

@@ -14,6 +14,8 @@ namespace
 constexpr double kAckPatience = 4.0;
 /// Seconds between two checks for acknowledgements.
 constexpr double kLook = 0.05;
+/// Seconds between the closing of two services, because each one is announced to every participant.
+constexpr double kCloseEvery = 0.02;
 
 std::uint64_t random_number()
 {
@@ -40,6 +42,7 @@ HandoffSource::~HandoffSource()
 {
   call_off();
   ask_no_more();
+  entities_.alarms.stop(closing_alarm_);
 }
 
 // --- the state ---------------------------------------------------------------------------------
@@ -190,7 +193,23 @@ void HandoffSource::take_report(const HandoffReport & report)
     asked_ = true;
     switch_over();
   } else if (report.phase == Phase::kActive && entities_.mode == Mode::kSilent) {
-    entities_.close_services();
+    close_services();
+  }
+}
+
+/// Close one service now, and the others one by one.
+void HandoffSource::close_services()
+{
+  if (closing_alarm_ == 0) {
+    closing_alarm_ = entities_.alarms.start(kCloseEvery, [this] {close_next_service();});
+    close_next_service();
+  }
+}
+
+void HandoffSource::close_next_service()
+{
+  if (entities_.mode != Mode::kSilent || !entities_.close_next_service()) {
+    entities_.alarms.stop(closing_alarm_);
   }
 }
 

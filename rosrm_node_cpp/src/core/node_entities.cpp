@@ -271,13 +271,17 @@ std::vector<std::int64_t> NodeEntities::fall_silent()
   return due;
 }
 
-void NodeEntities::close_services()
+bool NodeEntities::close_next_service()
 {
-  for (const auto & opening : openings_) {
-    if (opening->is_service) {
-      close(*opening);
-    }
+  const auto next = std::find_if(
+    openings_.rbegin(), openings_.rend(), [](const auto & opening) {
+      return opening->is_service && opening->is_open;
+    });
+  if (next == openings_.rend()) {
+    return false;
   }
+  close(**next);
+  return true;
 }
 
 void NodeEntities::close(Opening & opening)

@@ -49,6 +49,8 @@ private:
   StateMark mark(bool last);
   std::vector<std::int64_t> still_due();
   void take_report(const HandoffReport & report);
+  void close_services();
+  void close_next_service();
   void attach();
   void switch_over();
   void fall_silent();
@@ -81,6 +83,7 @@ private:
   double silent_since_ = 0.0;
   int release_alarm_ = 0;
   int ask_alarm_ = 0;
+  int closing_alarm_ = 0;
   /// Handoff for which the source is silent.
   std::uint64_t silent_for_ = 0;
   std::unique_ptr<SealedWriter> questions_;

@@ -152,8 +152,9 @@ public:
   /// Stop publishing and all timers; return `timers_due` from before.
   std::vector<std::int64_t> fall_silent();
 
-  /// Close all services: the successor answers, and requests to this node would be lost.
-  void close_services();
+  /// Close one service, the newest first; return false if none is open. The successor answers, and
+  /// requests to this node would be lost.
+  bool close_next_service();
 
   /// Return the processed messages of each buffered input, for a mark of the state.
   std::vector<CoveredInput> covered_inputs() const;
