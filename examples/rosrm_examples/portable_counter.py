@@ -4,8 +4,8 @@
 
 It holds MB of memory and publishes on `count` (std_msgs/Int64MultiArray) the count, 1, 2, 3, ...;
 the number of complete reads of its memory; and the CRC-32 of its content at the last one.
-With `--write` it also inverts its memory, a part at each count; the checksum is that of the bytes
-before.
+With `--write` the node also inverts a part of its memory at each count. The checksum remains that
+of the original content, so it must not change.
 """
 
 from __future__ import annotations
@@ -67,7 +67,10 @@ class PortableCounter(PortableNode):
             self.at = self.checksum_so_far = 0
 
     def original(self, begin: int, end: int) -> Iterator[bytearray]:
-        """Yield a part of the memory with its first content; `written` splits the inverted part."""
+        """Yield a part of the memory with its original content.
+
+        The bytes before the index `written` have been inverted once more than those after it.
+        """
         for first, after, inverted in (
             (begin, min(end, self.written), self.inverts),
             (max(begin, self.written), end, not self.inverts),
@@ -101,8 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--mb", type=_positive, default=1.0, help="MB of memory")
     parser.add_argument("--period", type=_positive, default=0.1, help="seconds between two counts")
     parser.add_argument(
-        "--write", type=_positive, default=0.0, help="share of the memory to write each second"
-    )
+        "--write", type=_positive, default=0.0,
+        help="share of the memory that is inverted each second, e.g. 0.01 (default: 0)",
+    )  # fmt: skip
     options = parser.parse_args(given[:at])
     run_portable(
         lambda: PortableCounter(options.mb, options.period, options.write), args=given[at:]

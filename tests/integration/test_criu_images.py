@@ -53,7 +53,7 @@ def counter(theatre):
     return actor
 
 
-#: Holds 8 MB, changes 200 bytes of it at SIGUSR1, and says the checksum at SIGUSR2.
+#: Holds 8 MB, changes 200 bytes of it at SIGUSR1, and prints the checksum at SIGUSR2.
 CHANGER = """
 import os, signal, zlib
 held, step = bytearray(range(256)) * (8_000_000 // 256), 40_000
@@ -82,10 +82,10 @@ def test_a_process_is_restored_from_a_copy_and_its_later_changes(theatre):
     os.kill(actor.pid, signal.SIGUSR2)
     eventually(actor.numbers, "a checksum")
     directory = theatre.dump(actor)
-    sizes = copied_pages.leave_out(directory, copy)
+    sizes = copied_pages.remove_copied_pages(directory, copy)
     changed = image.file_sizes(directory)
     assert sum(size for name, size in changed.items() if "/pages-" in name) < 3_000_000
-    copied_pages.put_in_place(directory, copy.directory)
+    copied_pages.move_into_parent(directory, copy.directory)
     made = image.file_checksums(directory, (sizes := {**changed, **sizes}))
     image.write(directory, replace(theatre.manifest, sizes=sizes, checksums=made))
     restored = theatre.restore(directory)

@@ -149,7 +149,7 @@ def test_missing_peers_are_named_when_patience_ends(node) -> None:
 
 
 def test_a_sample_is_missed_until_its_reader_acknowledges(stage, node) -> None:
-    """The node has a sample that nobody has read while its reader is stopped, and then no more."""
+    """`have_acknowledged` is False while the reader is stopped, and True after it continues."""
     output = node.create_publisher(Int64, "out", RELIABLE)
     domain = str(node.context.get_domain_id())
     environment = {**os.environ, "ROS_DOMAIN_ID": domain}

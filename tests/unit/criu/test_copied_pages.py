@@ -15,7 +15,7 @@ from rosrm.errors import CriuError
 from rosrm_criu.engine import copied_pages, memory_copy, protobuf
 from rosrm_criu.engine.copied_pages import Entry, Pagemap
 from rosrm_criu.engine.image import PAGES, PARENT
-from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, Run, file_name
+from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
 
 PID = 7
 IN_PARENT, PRESENT = 1, 4
@@ -31,15 +31,15 @@ def content(number: int) -> bytes:
     return bytes(PAGE - 1) + bytes([number])
 
 
-def runs_of(memory: dict[int, int]) -> list[Run]:
-    """Return the pages of a memory as the longest possible runs."""
-    runs: list[Run] = []
+def ranges_of(memory: dict[int, int]) -> list[PageRange]:
+    """Return the pages of a memory as the longest possible ranges."""
+    ranges: list[PageRange] = []
     for page in sorted(memory):
-        if runs and runs[-1].end == page * PAGE:
-            runs[-1] = Run(runs[-1].begin, runs[-1].pages + 1)
+        if ranges and ranges[-1].end == page * PAGE:
+            ranges[-1] = PageRange(ranges[-1].begin, ranges[-1].pages + 1)
         else:
-            runs.append(Run(page * PAGE, 1))
-    return runs
+            ranges.append(PageRange(page * PAGE, 1))
+    return ranges
 
 
 def write_pages(path: Path, memory: dict[int, int]) -> None:
@@ -51,11 +51,12 @@ def dump_after_copy(folder: Path, before: dict[int, int], after: dict[int, int])
     images, copies = folder / PAGES, folder / "copies"
     images.mkdir()
     copies.mkdir()
-    pagemap = Pagemap(SAMPLE[: protobuf.MAGIC], 1, [Entry(run, PRESENT) for run in runs_of(after)])
+    entries = [Entry(one, PRESENT) for one in ranges_of(after)]
+    pagemap = Pagemap(SAMPLE[: protobuf.MAGIC], 1, entries)
     (images / f"pagemap-{PID}.img").write_bytes(pagemap.encoded())
     write_pages(images / "pages-1.img", after)
     write_pages(copies / file_name(PID), before)
-    return MemoryCopy(copies, {PID: runs_of(before)})
+    return MemoryCopy(copies, {PID: ranges_of(before)})
 
 
 def restored(images: Path) -> dict[int, bytes]:
@@ -79,13 +80,13 @@ def restored(images: Path) -> dict[int, bytes]:
 @example(FULL, FULL)
 @example(FULL, {**FULL, 3: 2, 64: 2})
 def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before, after):
-    """Whatever was mapped, unmapped or written since the copy, and no equal page is sent again."""
+    """Pages may be mapped, unmapped or written after the copy; only the changed ones are sent."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy = dump_after_copy(folder, before, after)
-        sizes = copied_pages.leave_out(folder, copy)
+        sizes = copied_pages.remove_copied_pages(folder, copy)
         sent = (folder / PAGES / "pages-1.img").stat().st_size // PAGE
-        copied_pages.put_in_place(folder, copy.directory)
+        copied_pages.move_into_parent(folder, copy.directory)
         expected = {page: content(number) for page, number in after.items()}
         if before:
             assert restored(folder / PAGES) == expected
@@ -99,7 +100,7 @@ def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before
 def test_the_format_is_that_of_criu():
     """A pagemap that CRIU wrote is written again as the same bytes."""
     found = Pagemap.decoded(SAMPLE)
-    assert (found.file, [run.pages for run, _ in found.entries]) == (1, [1])
+    assert (found.file, [one.pages for one, _ in found.entries]) == (1, [1])
     assert found.encoded() == SAMPLE
 
 
@@ -119,13 +120,13 @@ def test_a_dump_of_an_unknown_form_stays_as_it_is(tmp_path, change):
     pagemap.write_bytes(change(pagemap.read_bytes()))
     before = {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()}
     with pytest.raises((ValueError, KeyError)):
-        copied_pages.leave_out(tmp_path, copy)
+        copied_pages.remove_copied_pages(tmp_path, copy)
     assert {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()} == before
 
 
 # --- the copy ---------------------------------------------------------------------------------
 
-#: Maps 1 MiB of ones and 1 MiB that it never touches, and tells where.
+#: Maps 1 MiB of ones and 1 MiB that it never touches, and prints their address.
 HOLDER = """
 import ctypes, mmap, sys
 area = mmap.mmap(-1, 1 << 21, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
@@ -150,9 +151,9 @@ def test_the_memory_of_a_running_process_is_copied(tmp_path, holder):
     copy = memory_copy.copy([holder.pid], tmp_path / "copy", 60.0)
     file = copy.directory / file_name(holder.pid)
     found, at, data = {}, 0, file.read_bytes()
-    for run in copy.runs[holder.pid]:
-        for page in range(run.pages):
-            found[run.begin + page * PAGE] = data[at : at + PAGE]
+    for one in copy.ranges[holder.pid]:
+        for page in range(one.pages):
+            found[one.begin + page * PAGE] = data[at : at + PAGE]
             at += PAGE
     assert at == len(data) <= memory_copy.size_of([holder.pid])
     assert all(found[begin + offset] == b"\1" * PAGE for offset in range(0, 1 << 20, PAGE))

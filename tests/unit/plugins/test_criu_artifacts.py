@@ -78,7 +78,7 @@ def test_the_wait_for_a_step_has_a_timeout(attempt):
 def test_remains_of_a_former_slave_are_removed(tmp_path, monkeypatch):
     """Offered images at once, fetched ones later, also that of an instance that may end since."""
     later = []
-    monkeypatch.setattr(artifacts, "later", lambda *call: later.append(call))
+    monkeypatch.setattr(artifacts, "call_later", lambda *call: later.append(call))
     for place in (outgoing(tmp_path, 1), incoming(tmp_path, 2), incoming(tmp_path, 3)):
         place.mkdir(parents=True)
         (place / "manifest.json").touch()
@@ -94,7 +94,7 @@ def test_remains_of_a_former_slave_are_removed(tmp_path, monkeypatch):
 def test_an_image_is_not_removed_while_it_is_restored(tmp_path, monkeypatch):
     """A large image takes longer than a slave keeps the rest of its predecessor."""
     later = []
-    monkeypatch.setattr(artifacts, "later", lambda *call: later.append(call))
+    monkeypatch.setattr(artifacts, "call_later", lambda *call: later.append(call))
     directory = incoming(tmp_path, 1)
     directory.mkdir(parents=True)
     words = [sys.executable, "-c", "input()", str(directory)]

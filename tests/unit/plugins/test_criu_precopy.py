@@ -67,15 +67,15 @@ class Steps:
 
     @property
     def received(self) -> str:
-        return precopy.received(StepArguments.of(self.arguments()))
+        return precopy.received_fingerprint(StepArguments.of(self.arguments()))
 
     @property
     def there(self):
         return received_copy(self.folder, self.number)
 
     def close(self) -> None:
-        precopy.forget_sent(self.folder, self.number)
-        precopy.forget_received(self.folder, self.number)
+        precopy.remove_sent_copy(self.folder, self.number)
+        precopy.remove_received_copy(self.folder, self.number)
         if fetcher := artifacts.take_fetcher(self.number):
             fetcher.close()
         self.process.communicate()
@@ -117,7 +117,7 @@ def test_no_room_at_the_destination_is_no_failure(steps):
 
 
 def test_a_process_that_has_ended_is_no_failure(steps):
-    """Its copy is left out, wherever the steps are."""
+    """If the process ends between two steps, the later steps make and fetch no copy."""
     steps.call(MEASURE_MEMORY, precopy.measure_memory)
     steps.call(EXPECT_COPY, precopy.expect_copy)
     steps.process.communicate()
@@ -130,7 +130,7 @@ def test_a_process_that_has_ended_is_no_failure(steps):
 def test_a_source_that_withdraws_its_copy_is_no_failure(steps):
     """The destination keeps no part of it."""
     steps.until_offered()
-    precopy.forget_sent(steps.folder, steps.number)
+    precopy.remove_sent_copy(steps.folder, steps.number)
     assert "cannot be reached" in steps.fetch()["skipped"]
     assert steps.received == ""
     assert not steps.there.exists()
@@ -181,7 +181,7 @@ def test_an_unused_copy_expires_at_both_ends(steps):
 
 
 def test_copies_of_a_former_slave_are_removed(tmp_path):
-    """No later step of it can use them."""
+    """A new slave has no offers of its predecessor, so no step can use these copies."""
     for place in (sent_copy(tmp_path, 1), received_copy(tmp_path, 1)):
         place.mkdir(parents=True)
     precopy.sweep(tmp_path)

@@ -195,7 +195,7 @@ def _end_of(process: subprocess.Popen[bytes], timeout: float) -> int | None:
     """Return the exit code; None: the timeout passed, and the process group was killed."""
     has_ended = False
     try:
-        has_ended = _has_ended(process.pid, timeout)
+        has_ended = _wait_for_end(process.pid, timeout)
     finally:
         if not has_ended:  # also if this wait is interrupted: the process would never be reaped
             with contextlib.suppress(ProcessLookupError):
@@ -204,10 +204,11 @@ def _end_of(process: subprocess.Popen[bytes], timeout: float) -> int | None:
     return code if has_ended else None
 
 
-def _has_ended(pid: int, timeout: float) -> bool:
-    """Wait for the end of a child; return False after the timeout in seconds.
+def _wait_for_end(pid: int, timeout: float) -> bool:
+    """Wait for the end of a child; return True if it ended within `timeout` seconds.
 
-    `Popen.wait` with a timeout polls, so it returns up to 0.05 s late, while the node is frozen.
+    A pidfd reports the end at once. `Popen.wait` with a timeout polls and returns up to 0.05 s
+    late, and the node is frozen for that time.
     """
     descriptor = os.pidfd_open(pid)
     try:

@@ -1,4 +1,4 @@
-"""Removal of pages from a dump that a `MemoryCopy` has too, so that they are not sent again.
+"""Removal of those pages from a dump that are equal in a `MemoryCopy`, which was sent before.
 
 CRIU's images may have a parent: an image of the same processes in the folder `parent`. A page that
 is marked as in the parent is restored from there. Here the parent is the copy, and pages are equal
@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 
 from rosrm_criu.engine import protobuf
 from rosrm_criu.engine.image import PAGES, PARENT
-from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, Run, file_name
+from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
 
-#: Flags of a pagemap_entry: its pages are in the parent; its pages follow in the file of pages.
+#: Flags of CRIU's pagemap_entry: PE_PARENT (the pages are in the parent image), PE_PRESENT (the
+#: pages are in the file of pages), PE_LAZY (they may be restored on their first use).
 _IN_PARENT, _PRESENT, _LAZY = 1, 4, 2
 #: Pages that are compared at once, so that the results stay in the processor's cache.
 _AT_ONCE: Final = 64
@@ -32,19 +33,19 @@ _NEW: Final = ".new"
 #: Name of a file with copied pages.
 _COPY: Final = re.compile(r"pages-\d+\.img", re.ASCII)
 
-#: Fields of a pagemap_entry: the number of pages has one of 32 and one of 64 bits.
+#: Field numbers of a pagemap_entry. The number of pages is in a field of 32 or of 64 bits.
 _ADDRESS, _COUNT_32, _FLAGS, _COUNT = 1, 2, 4, 5
 
 
 class Entry(NamedTuple):
-    """Adjacent pages of an image, with the flags of CRIU.
+    """Range of pages of an image, with the flags of CRIU.
 
     Attributes:
-        run: the pages.
+        page_range: the addresses of the pages.
         flags: see `_IN_PARENT`.
     """
 
-    run: Run
+    page_range: PageRange
     flags: int
 
 
@@ -74,11 +75,11 @@ class Pagemap:
         messages = [
             protobuf.encoded_number(1, self.file),
             *(
-                protobuf.encoded_number(_ADDRESS, run.begin)
+                protobuf.encoded_number(_ADDRESS, pages.begin)
                 + protobuf.encoded_number(_COUNT_32, 0)
                 + protobuf.encoded_number(_FLAGS, flags)
-                + protobuf.encoded_number(_COUNT, run.pages)
-                for run, flags in self.entries
+                + protobuf.encoded_number(_COUNT, pages.pages)
+                for pages, flags in self.entries
             ),
         ]
         sized = (struct.pack("<I", len(message)) + message for message in messages)
@@ -91,11 +92,11 @@ def _entry(message: bytes) -> Entry:
     if flags not in (_PRESENT, _PRESENT | _LAZY):
         raise ValueError(f"an entry has the flags {flags}")
     count = values.get(_COUNT) or values[_COUNT_32]
-    return Entry(Run(values[_ADDRESS], count), flags)
+    return Entry(PageRange(values[_ADDRESS], count), flags)
 
 
 def _numbers(message: bytes, known: Collection[int]) -> dict[int, int]:
-    """Return the fields of a message; raise ValueError for an unknown one or one of bytes."""
+    """Return the fields of a message; raise ValueError for an unknown field or a field of bytes."""
     values = {}
     for number, value, _ in protobuf.fields(message):
         if number not in known or isinstance(value, bytes):
@@ -104,8 +105,8 @@ def _numbers(message: bytes, known: Collection[int]) -> dict[int, int]:
     return values
 
 
-def leave_out(directory: Path, copy: MemoryCopy) -> dict[str, int]:
-    """Remove the copied pages from a dump, and mark them as in the parent.
+def remove_copied_pages(directory: Path, copy: MemoryCopy) -> dict[str, int]:
+    """Remove the pages from a dump that are equal in a copy, and mark them as in the parent.
 
     Args:
         directory: of the image.
@@ -123,8 +124,8 @@ def leave_out(directory: Path, copy: MemoryCopy) -> dict[str, int]:
     try:
         sizes = {
             f"{PARENT}/{file_name(pid)}": _prepare(images, parent, copy, pid)
-            for pid, runs in copy.runs.items()
-            if runs and (images / f"pagemap-{pid}.img").exists()
+            for pid, ranges in copy.ranges.items()
+            if ranges and (images / f"pagemap-{pid}.img").exists()
         }
     except BaseException:
         shutil.rmtree(parent)
@@ -138,81 +139,84 @@ def leave_out(directory: Path, copy: MemoryCopy) -> dict[str, int]:
 
 def _prepare(images: Path, parent: Path, copy: MemoryCopy, pid: int) -> int:
     """Write the new files of one process; return the bytes of its copied pages."""
-    name, runs = f"pagemap-{pid}.img", copy.runs[pid]
+    name, ranges = f"pagemap-{pid}.img", copy.ranges[pid]
     pagemap = Pagemap.decoded((images / name).read_bytes())
     pages = f"pages-{pagemap.file}.img"
     dumped, before = _pages(images / pages), _pages(copy.directory / file_name(pid))
-    same = same_pages([one.run for one in pagemap.entries], runs, dumped, before)
-    entries = list(divided(pagemap.entries, same))
+    same = same_pages([one.page_range for one in pagemap.entries], ranges, dumped, before)
+    entries = list(split_entries(pagemap.entries, same))
     _write(images / f"{name}{_NEW}", [Pagemap(pagemap.magic, pagemap.file, entries).encoded()])
     _write(images / f"{pages}{_NEW}", _changed(entries, dumped))
-    own = Pagemap(pagemap.magic, pid, [Entry(run, _PRESENT) for run in runs])
+    own = Pagemap(pagemap.magic, pid, [Entry(one, _PRESENT) for one in ranges])
     _write(parent / name, [own.encoded()])
     return before.nbytes
 
 
 def _pages(path: Path) -> NDArray[np.uint64]:
-    """Return the pages of a file, one a row."""
+    """Return the pages of a file as a matrix, one page in each row."""
     size = path.stat().st_size
     flat = np.asarray(np.memmap(path, np.uint64, "r")) if size else np.empty(0, np.uint64)
     return flat.reshape(-1, PAGE // 8)
 
 
 def same_pages(
-    runs: Iterable[Run], copied: Sequence[Run], pages: NDArray[np.uint64], copy: NDArray[np.uint64]
+    dumped: Iterable[PageRange],
+    copied: Sequence[PageRange],
+    pages: NDArray[np.uint64],
+    copy: NDArray[np.uint64],
 ) -> NDArray[np.bool_]:
-    """Return for each page of a dump whether the copy has the same content at its address.
+    """Return the mask of the dumped pages that are equal to the copied page of the same address.
 
     Args:
-        runs: of the dump, in the order of its pages.
-        copied: of the copy, in the order of its pages and by ascending address.
-        pages: of the dump, one a row.
-        copy: the copied pages, one a row.
+        dumped: ranges of the dump, in the order of its pages.
+        copied: ranges of the copy, in the order of its pages and by ascending address.
+        pages: of the dump, one in each row.
+        copy: the copied pages, one in each row.
 
     Raises:
-        ValueError: the number of pages is not that of the runs.
+        ValueError: the number of pages is not that of the ranges.
     """
     same = np.zeros(len(pages), np.bool_)
-    begins = [run.begin for run in copied]
-    rows = [0, *accumulate(run.pages for run in copied)]
+    begins = [one.begin for one in copied]
+    rows = [0, *accumulate(one.pages for one in copied)]
     row = 0
-    for run in runs:
-        at = max(bisect_right(begins, run.begin) - 1, 0)
-        while at < len(copied) and copied[at].begin < run.end:
-            low, high = max(run.begin, copied[at].begin), min(run.end, copied[at].end)
+    for one in dumped:
+        at = max(bisect_right(begins, one.begin) - 1, 0)
+        while at < len(copied) and copied[at].begin < one.end:
+            low, high = max(one.begin, copied[at].begin), min(one.end, copied[at].end)
             there = rows[at] + (low - copied[at].begin) // PAGE
-            begin, end = row + (low - run.begin) // PAGE, row + (high - run.begin) // PAGE
+            begin, end = row + (low - one.begin) // PAGE, row + (high - one.begin) // PAGE
             for here in range(begin, end, _AT_ONCE):
                 after = min(here + _AT_ONCE, end)
                 part = copy[there + here - begin : there + after - begin]
                 same[here:after] = (pages[here:after] == part).all(axis=1)
             at += 1
-        row += run.pages
+        row += one.pages
     if (row, rows[-1]) != (len(pages), len(copy)):
-        raise ValueError("the files have another number of pages than their lists")
+        raise ValueError("the files have another number of pages than their ranges")
     return same
 
 
-def divided(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator[Entry]:
-    """Yield the entries of a dump, divided into pages that are in the parent and others."""
+def split_entries(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator[Entry]:
+    """Yield the entries of a dump, split into pages that are in the parent and others."""
     row = 0
     for (begin, pages), flags in entries:
         marks = same[row : row + pages]
         edges = [0, *(np.flatnonzero(np.diff(marks)) + 1).tolist(), pages]
         for first, after in pairwise(edges):
             if first < after:
-                run = Run(begin + first * PAGE, after - first)
-                yield Entry(run, _IN_PARENT if marks[first] else flags)
+                part = PageRange(begin + first * PAGE, after - first)
+                yield Entry(part, _IN_PARENT if marks[first] else flags)
         row += pages
 
 
 def _changed(entries: Iterable[Entry], pages: NDArray[np.uint64]) -> Iterator[memoryview]:
     """Yield the pages that are not in the parent."""
     row = 0
-    for run, flags in entries:
+    for one, flags in entries:
         if flags != _IN_PARENT:
-            yield pages[row : row + run.pages].data
-        row += run.pages
+            yield pages[row : row + one.pages].data
+        row += one.pages
 
 
 def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
@@ -222,14 +226,14 @@ def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
             file.write(piece)
 
 
-def put_in_place(directory: Path, copies: Path) -> None:
-    """Move received copies into a received image, if it refers to them; raise OSError."""
+def move_into_parent(directory: Path, copies: Path) -> None:
+    """Move received copies into the parent of a received image, if it has one; raise OSError."""
     parent = directory / PARENT
     if parent.is_dir():
         for path in copies.iterdir():
             path.rename(parent / path.name)
 
 
-def are_copies(directory: Path) -> bool:
+def has_only_copied_pages(directory: Path) -> bool:
     """Return True if a received directory contains copied pages alone."""
     return all(path.is_file() and _COPY.fullmatch(path.name) for path in directory.iterdir())

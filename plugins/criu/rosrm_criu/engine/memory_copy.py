@@ -33,8 +33,8 @@ _OF_FILE: Final = np.uint64(1 << 61)
 _AREA: Final = re.compile(r"([0-9a-f]+)-([0-9a-f]+) ")
 
 
-class Run(NamedTuple):
-    """Adjacent pages.
+class PageRange(NamedTuple):
+    """Range of adjacent pages in the address space of a process.
 
     Attributes:
         begin: address of the first page.
@@ -56,11 +56,12 @@ class MemoryCopy:
 
     Attributes:
         directory: contains the file `file_name(pid)` of each process, with its pages in order.
-        runs: the pages of each process, by its pid in its own namespace, by ascending address.
+        ranges: the copied pages of each process, by ascending address. The keys are pids in the
+            namespaces of the processes.
     """
 
     directory: Path
-    runs: Mapping[int, Sequence[Run]]
+    ranges: Mapping[int, Sequence[PageRange]]
 
 
 def file_name(pid: int) -> str:
@@ -92,25 +93,25 @@ def copy(pids: Iterable[int], directory: Path, timeout: float) -> MemoryCopy:
     )
 
 
-def _copy_one(pid: int, directory: Path, deadline: float) -> list[Run]:
+def _copy_one(pid: int, directory: Path, deadline: float) -> list[PageRange]:
     path = directory / file_name(inner_pid(pid))
     path.touch(mode=0o600, exist_ok=False)
-    copied: list[Run] = []
+    copied: list[PageRange] = []
     with (
         path.open("wb", buffering=0) as file,
         Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory,
         Path(f"/proc/{pid}/pagemap").open("rb", buffering=0) as pagemap,
     ):
         for begin, end, _ in _areas(pid):
-            for run in _held(pagemap.fileno(), begin, end):
+            for found in _held(pagemap.fileno(), begin, end):
                 size = 0
-                for piece in _pieces(memory.fileno(), run):
+                for piece in _pieces(memory.fileno(), found):
                     if time.monotonic() > deadline:
                         raise CriuError("the memory could not be copied in time")
                     file.write(piece)
                     size += len(piece)
                 if size:
-                    copied.append(Run(run.begin, size // PAGE))
+                    copied.append(PageRange(found.begin, size // PAGE))
     return copied
 
 
@@ -124,7 +125,7 @@ def _areas(pid: int) -> Iterator[tuple[int, int, int]]:
             yield begin, end, size
 
 
-def _held(pagemap: int, begin: int, end: int) -> Iterator[Run]:
+def _held(pagemap: int, begin: int, end: int) -> Iterator[PageRange]:
     """Yield the pages of an area that exist and are in no file."""
     for start in range(begin, end, _SPAN):
         size = (min(end, start + _SPAN) - start) // PAGE * 8
@@ -132,15 +133,15 @@ def _held(pagemap: int, begin: int, end: int) -> Iterator[Run]:
         held = ((entries & _HELD) != 0) & ((entries & _OF_FILE) == 0)
         edges = np.flatnonzero(np.diff(held, prepend=False, append=False)).tolist()
         for first, after in zip(edges[::2], edges[1::2], strict=True):
-            yield Run(start + first * PAGE, after - first)
+            yield PageRange(start + first * PAGE, after - first)
 
 
-def _pieces(memory: int, run: Run) -> Iterator[bytes]:
-    """Yield whole pages from the beginning of a run, up to one that has been unmapped since."""
-    at = run.begin
-    while at < run.end:
+def _pieces(memory: int, pages: PageRange) -> Iterator[bytes]:
+    """Yield whole pages from the beginning of a range, up to one that has been unmapped since."""
+    at = pages.begin
+    while at < pages.end:
         try:
-            piece = os.pread(memory, min(_PIECE, run.end - at), at)
+            piece = os.pread(memory, min(_PIECE, pages.end - at), at)
         except OSError:
             return
         piece = piece[: len(piece) // PAGE * PAGE]

@@ -48,11 +48,11 @@ def periodic(state: Path, number: int) -> Path:
     return state / "images" / f"periodic-{number}"
 
 
-#: First part of the names of the images of a kind.
-Kind = Literal["out", "in", "kept", "periodic", "copy-out", "copy-in"]
+#: Kinds of images and memory copies: the prefix of the names of their directories.
+ImageKind = Literal["out", "in", "kept", "periodic", "copy-out", "copy-in"]
 
 
-def numbers(state: Path, kind: Kind) -> list[int]:
+def numbers(state: Path, kind: ImageKind) -> list[int]:
     """Return the numbers of the instances that have an image of a kind."""
     found = [path.name.removeprefix(f"{kind}-") for path in (state / "images").glob(f"{kind}-*")]
     return sorted(int(number) for number in found if number.isdigit())

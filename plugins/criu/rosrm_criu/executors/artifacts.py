@@ -96,7 +96,7 @@ def open_fetcher(number: int, keep: float) -> str:
         _fetchers[number] = fetcher
     if former is not None:
         former.close()
-    later(keep, _dismiss, number, fetcher)
+    call_later(keep, _dismiss, number, fetcher)
     return certificate
 
 
@@ -108,7 +108,7 @@ def take_fetcher(number: int) -> Fetcher | None:
 
 def close_soon(fetcher: Fetcher) -> None:
     """Close the receiving end in the background, because a node is frozen until the restore."""
-    later(0.0, fetcher.close)
+    call_later(0.0, fetcher.close)
 
 
 def _dismiss(number: int, fetcher: Fetcher) -> None:
@@ -138,7 +138,7 @@ def await_restored(asked: StepArguments) -> Outcome:
 
 def remove_unused_later(directory: Path, keep: float) -> None:
     """Call `remove_unused` after `keep` seconds, or later if a restore from the image runs then."""
-    later(keep, _remove_if_idle, directory, keep)
+    call_later(keep, _remove_if_idle, directory, keep)
 
 
 def _remove_if_idle(directory: Path, keep: float) -> None:
@@ -215,7 +215,7 @@ def number_of(instance: str) -> int:
     return int(instance.rpartition("#")[2])
 
 
-def later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:
+def call_later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:
     """Call a function later, in a thread that does not keep the slave from ending."""
     timer = threading.Timer(seconds, do, arguments)
     timer.daemon = True

@@ -107,7 +107,7 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
             artifacts.withdraw(asked.state, asked.source)
         raise
     finally:  # in the background, because the node is frozen
-        artifacts.later(0.0, precopy.forget_sent, asked.state, asked.source)
+        artifacts.call_later(0.0, precopy.remove_sent_copy, asked.state, asked.source)
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
         "seconds": {
@@ -193,7 +193,7 @@ def introduce(arguments: Answer) -> Answer:
     if named and not Path(named).expanduser().is_dir():
         raise CriuError(f"its working directory {named} does not exist on {asked.host}: make it")
     certificate = artifacts.open_fetcher(asked.destination, float(arguments["keep"]))
-    return {"certificate": certificate, "copy": precopy.received(asked)}
+    return {"certificate": certificate, "copy": precopy.received_fingerprint(asked)}
 
 
 def fetch_image(arguments: Answer) -> Answer:

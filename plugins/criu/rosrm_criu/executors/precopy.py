@@ -25,7 +25,7 @@ from rosrm_criu.executors.request import StepArguments
 from rosrm_criu.plans import COPY_MEMORY, EXPECT_COPY, FETCH_COPY, INTRODUCE, MEASURE_MEMORY
 from rosrm_criu.transfer import Offer, Sender
 
-#: Bytes of the least memory that is copied; less is dumped, sent and restored in a second.
+#: Minimum bytes of memory for a copy. Less memory is dumped, sent and restored within a second.
 LEAST: Final = 64 << 20
 
 
@@ -50,7 +50,7 @@ _sent: Final[dict[int, _Sent]] = {}
 _received: Final[dict[int, str]] = {}
 
 
-#: A step with parsed arguments, and the executor of it.
+#: Function of a step, called with parsed arguments; executor of the step, called with a mapping.
 _Work = Callable[[StepArguments], Answer]
 _Executor = Callable[[Answer], Answer]
 
@@ -80,7 +80,10 @@ def _optional(step: str) -> Callable[[_Work], _Executor]:
 
 @_optional(MEASURE_MEMORY)
 def measure_memory(asked: StepArguments) -> Answer:
-    """Return the bytes to copy; 0: too few, or there is no room for a copy and the dump."""
+    """Return the bytes to copy; 0: less than `LEAST`, which is not worth a copy.
+
+    The answer is `skipped` with the reason if the disk has no room for the copy and the dump.
+    """
     pids = _pids(asked)
     size = memory_copy.size_of(pids)
     if size < LEAST:
@@ -97,11 +100,12 @@ def copy_memory(asked: StepArguments) -> Answer:
     to = asked.results[EXPECT_COPY].get("certificate")
     if not to:
         return {}
-    forget_sent(asked.state, asked.source)
+    remove_sent_copy(asked.state, asked.source)
     directory = sent_copy(asked.state, asked.source)
     sender = Sender()
     try:
-        # The other half is for the start of the offer; the step itself must not time out.
+        # Half of the timeout, because the sender must start after the copy and before the step
+        # times out.
         copy = memory_copy.copy(_pids(asked), directory, asked.timeout / 2)
         offer = sender.offer(
             directory, seconds=float(asked.arguments["offer"]), to=str(to),
@@ -114,12 +118,14 @@ def copy_memory(asked: StepArguments) -> Answer:
     sent = _Sent(copy, offer.fingerprint, sender)
     with _changing:
         _sent[asked.source] = sent
-    artifacts.later(float(asked.arguments["keep"]), forget_sent, asked.state, asked.source, sent)
+    artifacts.call_later(
+        float(asked.arguments["keep"]), remove_sent_copy, asked.state, asked.source, sent
+    )
     return {"offer": offer.as_json()}
 
 
 def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) -> bool:
-    """Remove the pages from a dump that the destination has received as a copy.
+    """Remove from a dump the pages that are equal in the copy at the destination.
 
     Args:
         asked: arguments of the step.
@@ -134,7 +140,7 @@ def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) 
     if sent is None or sent.offer != asked.results[INTRODUCE].get("copy"):
         return False
     try:
-        copied = copied_pages.leave_out(directory, sent.copy)
+        copied = copied_pages.remove_copied_pages(directory, sent.copy)
     except (OSError, ValueError, KeyError):  # the whole dump is sent
         return False
     sizes = {**image.file_sizes(directory), **copied}
@@ -142,7 +148,7 @@ def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) 
     return True
 
 
-def forget_sent(state: Path, number: int, only: _Sent | None = None) -> None:
+def remove_sent_copy(state: Path, number: int, only: _Sent | None = None) -> None:
     """Remove the copy of an instance at the source.
 
     Args:
@@ -169,7 +175,7 @@ def _pids(asked: StepArguments) -> Sequence[int]:
 
 @_optional(EXPECT_COPY)
 def expect_copy(asked: StepArguments) -> Answer:
-    """Prepare the fetch of the copy, if there will be one."""
+    """Open the receiving end for the copy, unless the source will send none."""
     if not asked.results[MEASURE_MEMORY].get("bytes"):
         return {}
     keep = float(asked.arguments["keep"])
@@ -183,7 +189,7 @@ def fetch_copy(asked: StepArguments) -> Answer:
         return {}
     offer = Offer.from_json(asked.results[COPY_MEMORY]["offer"])
     directory = received_copy(asked.state, asked.destination)
-    forget_received(asked.state, asked.destination)
+    remove_received_copy(asked.state, asked.destination)
     fetcher = artifacts.take_fetcher(asked.destination)
     if fetcher is None:
         raise CriuError("the slave was started again since the copy was offered")
@@ -192,17 +198,19 @@ def fetch_copy(asked: StepArguments) -> Answer:
         fetched = fetcher.fetch(offer, directory, timeout=asked.timeout, reserve=reserve)
     finally:
         artifacts.close_soon(fetcher)
-    if not copied_pages.are_copies(directory):
+    if not copied_pages.has_only_copied_pages(directory):
         artifacts.discard(directory)
-        raise CriuError("the copy holds other files than pages: refused")
+        raise CriuError("the copy contains other files than pages-PID.img: refused")
     with _changing:
         _received[asked.destination] = offer.fingerprint
     keep = float(asked.arguments["keep"])
-    artifacts.later(keep, forget_received, asked.state, asked.destination, offer.fingerprint)
+    artifacts.call_later(
+        keep, remove_received_copy, asked.state, asked.destination, offer.fingerprint
+    )
     return {"seconds": {"transfer": fetched.seconds}, "received": fetched.received}
 
 
-def received(asked: StepArguments) -> str:
+def received_fingerprint(asked: StepArguments) -> str:
     """Return the fingerprint of the offer of the received copy; "": there is none."""
     with _changing:
         is_here = received_copy(asked.state, asked.destination).is_dir()
@@ -212,11 +220,11 @@ def received(asked: StepArguments) -> str:
 def put_in_place(asked: StepArguments, directory: Path) -> None:
     """Add the received copy to a received image that refers to it; remove it otherwise."""
     with contextlib.suppress(OSError):  # the check of the image names a file that is missing
-        copied_pages.put_in_place(directory, received_copy(asked.state, asked.destination))
-    forget_received(asked.state, asked.destination)
+        copied_pages.move_into_parent(directory, received_copy(asked.state, asked.destination))
+    remove_received_copy(asked.state, asked.destination)
 
 
-def forget_received(state: Path, number: int, only: str = "") -> None:
+def remove_received_copy(state: Path, number: int, only: str = "") -> None:
     """Remove the copy for an instance at the destination.
 
     Args:

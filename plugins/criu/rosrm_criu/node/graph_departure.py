@@ -128,7 +128,7 @@ def await_readers(node: Any, patience: float) -> None:
 
 
 def have_acknowledged(node: Any) -> bool:
-    """Return True if all reliable readers of a node have all samples."""
+    """Return True if all reliable readers have acknowledged all samples of a node's publishers."""
     return all(one.wait_for_all_acked(Duration()) for one in node.publishers)
 
 

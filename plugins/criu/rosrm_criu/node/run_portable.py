@@ -36,7 +36,8 @@ _ENDING: Final = (signal.SIGINT, signal.SIGTERM)
 _GREETED: Final = 0.3
 #: Most attempts to enter. After that, a missing peer may have left, and others may see the node.
 _ENTRIES: Final = 4
-#: Seconds in which callbacks run on until all readers have acknowledged: over two heartbeats.
+#: Most seconds for which callbacks continue until all readers have acknowledged: more than two
+#: periods of the heartbeat (0.1 s).
 _ACKNOWLEDGED: Final = 0.25
 #: Seconds for pending work of callbacks (threads, coroutines) to end.
 _REST: Final = 5.0
@@ -202,9 +203,10 @@ class _Run:
         return departure, fault
 
     def _run_until_acknowledged(self) -> None:
-        """Run callbacks until no reader misses a sample, because `leave` waits for the readers.
+        """Run callbacks until all readers have acknowledged, so that the departure does not wait.
 
-        They acknowledge only after a heartbeat (0.1 s), in which the node would already be silent.
+        Readers acknowledge only after the next heartbeat of their writer (0.1 s). If the node
+        waited for that in its departure, it would be silent for that time.
         """
         deadline = time.monotonic() + _ACKNOWLEDGED
         while not have_acknowledged(self._node) and time.monotonic() < deadline:
