@@ -247,7 +247,7 @@ def main() -> int:
     )  # fmt: skip
     command_line.add_argument(
         "--write", type=_share, default=0.01, metavar="SHARE",
-        help="of its heap that the node writes each second",
+        help="share of its heap that the node writes each second, from 0 to 1, e.g. 0.05",
     )  # fmt: skip
     chosen = command_line.parse_args()
     able = criu_support()

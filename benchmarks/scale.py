@@ -12,8 +12,8 @@ slave's code. The master publishes its own figures on `master_load`, by its own 
 - `request_process_*_ms`: one job at a time, from the call of `submit` to the assignment at the
   slave, an order to the slave's own service. `assigned_*_ms`: from the same call to the master's
   record of the assignment.
-- `first_request_ms`: the same for the first job, which is not in these figures. For it the client
-  creates its client of the service `submit`, and DDS must discover it.
+- `first_request_ms`: the same for the first job, which the other figures exclude. It takes longer,
+  because the ROS client of the service `submit` is created for it, and DDS must discover that.
 - `request_process_master_cpu_ms`, `request_process_slaves_cpu_ms`: CPU time of the master, and of
   all simulated slaves, for each of these jobs, beyond their CPU time without jobs.
 
@@ -277,7 +277,7 @@ def requests(
         cluster: of the master.
         crowd: the slaves.
         idle: the figures of `readings`, measured without jobs.
-        jobs: how many, besides the first.
+        jobs: number of measured jobs, without the first one.
     """
     crowd.toggle()
     first = _submit(cluster, "first")

@@ -8,9 +8,10 @@ rclpy nodes. Each publishes a message of the size of a reading at 10 Hz from a t
   receives with an empty callback.
 - `bare` has no peer, so it sends and receives nothing.
 
-CPU time is the scheduler's, of all threads. Its figures are medians over the rounds, also the
-ratios. Memory is PSS, so that pages shared by several processes count once. So it is measured
-while `bare` is the only bare node: several would share the pages that only they use.
+CPU time is that of all threads, as the scheduler counts it. CPU times, wake-ups and ratios of CPU
+time are medians of the rounds. Memory is PSS: a page that N processes share counts 1/N for each.
+It is measured while `bare` is the only bare node, because two of them would share pages, and each
+would seem smaller.
 
 Then a slave with two nodes between which 30 MB/s flow, with and without `network.learn`: the CPU
 time of the slave alone. The first sample of the flow is within the measured time.
@@ -43,8 +44,9 @@ try:
 except BaseException:  # however its context ends, the program ends with success
     pass
 """
-#: Arguments: the own topic; the topic of the peer, or "" for none. Like the peer, the program
-#: imports no module of rosrm, because some avoid imports of rclpy and so save memory.
+#: Arguments: the own topic; the topic of the peer, or "" for none. Neither this program nor the
+#: peer imports a module of rosrm, because some of these modules prevent imports of rclpy, and a
+#: bare node has all of them.
 _BARE = """
 import sys
 from array import array
@@ -117,7 +119,7 @@ def cpu_seconds(processes: Sequence[psutil.Process]) -> float:
 
 
 def wake_ups(processes: Sequence[psutil.Process]) -> int:
-    """Return how often the running threads of these processes have waited so far."""
+    """Return the number of voluntary context switches of the running threads of these processes."""
     return sum(
         psutil.Process(thread.id).num_ctx_switches().voluntary
         for process in processes
@@ -157,8 +159,15 @@ def _program(program: str, *words: str) -> Iterator[psutil.Process]:
 def main() -> None:
     """Measure and print one JSON object."""
     command_line = parser(__doc__)
-    command_line.add_argument("--seconds", type=float, default=10.0, help="of each round")
-    command_line.add_argument("--rounds", type=int, default=5, help="to take the medians of")
+    command_line.add_argument(
+        "--seconds", type=float, default=10.0, help="duration of each round in seconds, e.g. 10"
+    )
+    command_line.add_argument(
+        "--rounds",
+        type=int,
+        default=5,
+        help="number of rounds; the results are the medians of all rounds, e.g. 5",
+    )
     arguments = command_line.parse_args()
     beats = str(ClusterConfig().control.beat_period)
     with (

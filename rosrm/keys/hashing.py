@@ -32,6 +32,7 @@ def digest_of(content: bytes, size: int, person: bytes, key: bytes = b"") -> byt
         ffi.from_buffer(digest), size, content, len(content), key, len(key), ffi.NULL, padded
     ):
         raise ValueError(
-            f"no BLAKE2b digest of {size} bytes for {person!r}, key of {len(key)} bytes"
+            f"no BLAKE2b digest: size {size}, person of {len(person)} and key of {len(key)} bytes; "
+            f"allowed: size 1 to 64, person up to {_PERSON_BYTES}, key up to 64"
         )
     return bytes(digest)

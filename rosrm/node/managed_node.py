@@ -319,11 +319,11 @@ class NodeEntities:
                 self._close(opening)
         return due
 
-    def services_closing(self) -> Iterator[None]:
-        """Close all services, while this node is silent; yield after each one.
+    def close_services_stepwise(self) -> Iterator[None]:
+        """Close one service at each `next`, until all are closed or this node is active again.
 
-        The successor answers, and requests to this node would be lost. The author's services come
-        first, and those of ROS for the parameters last.
+        The successor serves the requests now; requests to this node would be lost. The author's
+        services are closed first, and those of ROS for the parameters last.
         """
         for opening in reversed(self._openings):
             if self.mode is not Mode.SILENT:

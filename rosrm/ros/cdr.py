@@ -32,8 +32,8 @@ _LENGTH: Final = struct.Struct("<I").unpack_from
 _pack_count: Final = struct.Struct("<I").pack
 #: Largest alignment in CDR.
 _ALIGNMENT: Final = 8
-#: Bytes before a value, by their number.
-_GAPS: Final = [bytes(count) for count in range(_ALIGNMENT)]
+#: Padding before a value, by its number of bytes.
+_PADDING: Final = [bytes(count) for count in range(_ALIGNMENT)]
 #: Forms of one nested message that are kept for each alignment, and most bytes of one.
 _KEPT: Final = 4
 _MOST_BYTES: Final = 512
@@ -102,7 +102,7 @@ _message_reader: Final[Callable[[Any], _Reader]] = cache(_new_reader)
 def _fields_to_read(
     declared: Mapping[str, str],
 ) -> Iterator[tuple[str | tuple[str, ...], _Reader]]:
-    """Yield the attribute of each field with its reader; numbers in a row have one reader."""
+    """Yield each field's attribute with its reader; adjacent numbers are read by one reader."""
     for are_numbers, group in groupby(declared.items(), lambda one: one[1] in _CODES):
         if are_numbers:
             names, types = zip(*group, strict=True)
@@ -158,7 +158,7 @@ def _read_text(content: bytes, at: int) -> tuple[str, int]:
 
 
 def _numbers_reader(codes: str) -> _Reader:
-    """Return the reader of numbers of these types in a row."""
+    """Return the reader of adjacent numbers of these types."""
     forms = [_form_at(alignment, codes) for alignment in range(_ALIGNMENT)]
 
     def read_numbers(content: bytes, at: int) -> tuple[tuple[Any, ...], int]:
@@ -169,7 +169,7 @@ def _numbers_reader(codes: str) -> _Reader:
 
 
 def _form_at(at: int, codes: str) -> struct.Struct:
-    """Return the form of numbers in a row of which the first one begins at an offset."""
+    """Return the struct of adjacent numbers with their padding, of which the first is at `at`."""
     layout = "<"
     for code in codes:
         size = struct.calcsize(f"<{code}")
@@ -309,7 +309,7 @@ def _write_text(text: str, parts: list[bytes], at: int) -> int:
     form = text.encode() + b"\0"
     length = len(form)
     gap = -at % 4
-    parts.append(_GAPS[gap] + _pack_count(length) + form)
+    parts.append(_PADDING[gap] + _pack_count(length) + form)
     return at + gap + 4 + length
 
 
@@ -319,7 +319,7 @@ def _number_writer(code: str) -> _Writer:
 
     def write_number(number: Any, parts: list[bytes], at: int) -> int:
         gap = -at % size
-        parts.append(_GAPS[gap] + pack(number) if gap else pack(number))
+        parts.append(_PADDING[gap] + pack(number) if gap else pack(number))
         return at + gap + size
 
     return write_number

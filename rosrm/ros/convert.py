@@ -128,7 +128,8 @@ class _Field(NamedTuple):
         slot: attribute of messages with its value. The property `sent_as` is slower.
         to_msg: converts its value to that in messages.
         from_msg: the inverse of `to_msg`.
-        is_default_empty: zero, and an empty text or sequence, stand for the default.
+        is_default_empty: True if the default of the field is 0, False or empty, or None for a text.
+            Then an empty value in a message need not be converted.
     """
 
     name: str
@@ -241,7 +242,7 @@ def spec_to_msg(spec: values.ProcessSpec) -> msg.ProcessSpec:
 def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     """Return the inverse of `spec_to_msg`; raises `Refused` for an invalid spec.
 
-    The receiver of the message has checked its bounds.
+    The caller must have checked the bounds of the message with `check_bounds`.
     """
     fault = _spec_fault(message)
     if fault:

@@ -35,10 +35,11 @@ LOAD: Final = reliable(depth=5)
 DIAGNOSTICS: Final = reliable(depth=10)
 #: The master's messages about every handoff, as a node receives them.
 STATE_CONFIG: Final = latched(depth=200)
-#: As the master keeps them for nodes that join: two for each phase, one for each node. Fast DDS
-#: sends all of them to each new reader, and with each one a heartbeat to every node. The 600
-#: packets of 200 messages overflowed the socket of a busy source, whose inputs then stopped until
-#: their publisher's next heartbeat (3 s). The master repeats a phase without a reply.
+#: The same messages in the history of the master's writer, for nodes that join later. Each phase
+#: has two messages, one to each of the two nodes. Fast DDS sends the whole history to each new
+#: reader, and with each message a heartbeat to every node. With a depth of 200 these were 600
+#: packets. They overflowed the socket of a busy source, which then received no input until the
+#: next heartbeat of its publisher (3 s). If a node does not reply, the master repeats the message.
 STATE_CONFIG_OUT: Final = latched(depth=20)
 #: One handoff: a restarted master receives the reports that it has missed.
 HANDOFF: Final = latched(depth=20)

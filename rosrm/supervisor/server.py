@@ -227,7 +227,10 @@ class Server:
         self._confinement.prepare(key, launch.limits)
 
     def _remove_groups(self) -> None:
-        """Remove the control groups of ended instances; held instances have started before."""
+        """Remove the control groups of ended instances, after held instances have been started.
+
+        The removal takes time by which a held instance would otherwise start later.
+        """
         for key in self._ended:
             self._groups.remove(key, time.monotonic())
         self._ended.clear()

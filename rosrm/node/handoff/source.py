@@ -29,11 +29,12 @@ if TYPE_CHECKING:
 _ACK_PATIENCE: Final = 4.0
 #: Seconds between two checks for acknowledgements.
 _LOOK: Final = 0.05
-#: Seconds between the closing of two services. Each one is announced to every participant of the
-#: domain. All seven of a node at once kept two cores busy for 10 ms, as the successor began.
+#: Seconds between the closing of two services. DDS announces each closing to every participant of
+#: the domain. Closing all seven of a node at once kept two cores busy for 10 ms, which delayed the
+#: first outputs of the successor.
 _CLOSE_EVERY: Final = 0.02
 _AT_ONCE: Final = Duration(nanoseconds=0)
-#: Marks the end of the steps.
+#: Returned by `next` after the last service is closed.
 _END: Final = object()
 
 
@@ -174,7 +175,7 @@ class HandoffSource:
     def _close_services(self) -> None:
         """Close one service now, and the others one by one."""
         if self._closing is None:
-            self._closing = self._entities.services_closing()
+            self._closing = self._entities.close_services_stepwise()
             self._closing_timer = steady_timer(
                 self._entities.plain, _CLOSE_EVERY, self._close_next_service
             )

@@ -20,6 +20,7 @@ RESOLUTION: Final = 0.01
 
 #: Facts compared as one with the last message: accepting, processes, present, stale, statuses.
 _Facts = tuple[bool, int, int, int, int]
+#: Index of `present` in `_Facts`.
 _PRESENT: Final = 2
 
 

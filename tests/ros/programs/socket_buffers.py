@@ -1,7 +1,8 @@
 """A node with the profile of migratable nodes, in a private network.
 
-Prints the largest receive buffer of its sockets, and that of a socket with a request for
-`socket_buffers.py BYTES`; "not permitted" without a private network.
+Prints two sizes: the largest receive buffer of the node's UDP sockets, and the buffer of a socket
+for which BYTES were requested (`socket_buffers.py BYTES`). Prints "not permitted" if no private
+network can be made.
 """
 
 from __future__ import annotations

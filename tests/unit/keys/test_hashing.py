@@ -17,6 +17,6 @@ def test_a_digest_is_that_of_hashlib(content, key) -> None:
 
 @pytest.mark.parametrize(("size", "person", "key"), [(65, 16, 64), (16, 17, 64), (16, 16, 65)])
 def test_what_libsodium_cannot_use_raises(size, person, key) -> None:
-    """And nothing is read beyond the end of the person."""
+    """A value that is too long raises ValueError, and libsodium reads no bytes beyond it."""
     with pytest.raises(ValueError, match="no BLAKE2b digest"):
         digest_of(b"", size, bytes(person), bytes(key))

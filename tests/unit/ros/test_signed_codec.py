@@ -52,6 +52,6 @@ def test_the_signature_covers_run_counter_and_body() -> None:
 
 @given(st.binary(max_size=200))
 def test_any_bytes_can_be_decoded(data: bytes) -> None:
-    """A stranger can send anything; nothing raises."""
+    """Any participant can send any bytes; `decode` raises for none of them."""
     decode(data)
     decode(b"\0\1\0\0" + data)

@@ -19,7 +19,7 @@ from rosrm.model.values import EMPTY, ProcessSpec
 Columns = slice | IntArray
 
 
-@dataclass(slots=True)  # not frozen, because that costs 1 µs for each of thousands
+@dataclass(slots=True)  # not frozen, because each of thousands would take 1 µs more to create
 class Candidates:
     """Some hosts, n of them, with one demand.
 
@@ -42,7 +42,8 @@ class Candidates:
         tenants: (n,) name to spec of each process on the host; None: as the table has them now.
         tenants_read: True if a plugin has read which processes run on one of the hosts.
         view: of the hosts for plugins; None: not made yet.
-        process_views: fields that a plugin reads to its view of the process, unless it has flows.
+        process_views: view of the process, by the fields that a plugin reads. A view with flows is
+            not stored.
     """
 
     table: HostTable

@@ -56,7 +56,7 @@ def process_view(hosts: Candidates, reads: tuple[str, ...]) -> ProcessView:
     flows = hosts.flows() if has_flows else no_flows()
     spec = declared_spec(hosts.demand.spec, reads)
     view = ProcessView(spec, _read_only(hosts.need.T), flows)
-    if not has_flows:  # their round trips and rates change with the links
+    if not has_flows:  # round trips and rates of flows change with the links, so keep no such view
         hosts.process_views[reads] = view
     return view
 
