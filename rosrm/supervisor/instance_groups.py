@@ -51,7 +51,7 @@ class InstanceGroups:
         self._made: dict[Key, tuple[Tree, ...]] = {}
         self._unset: dict[Key, dict[str, Any]] = {}  # limits that could not be set at the start
         self._kills_before: dict[Key, int] = {}
-        self._prepared: dict[Key, tuple[LimitRule, dict[str, str]]] = {}  # limits and faults
+        self._prepared: dict[Key, LimitRule] = {}  # limits of groups made ahead without a fault
         self._emptied: dict[str, float] = {}
         self._homes: dict[str, int] = {}  # group to descriptor of its `tasks` file, for the return
         self._unfinished: dict[Key, set[Tree]] = {}  # groups that some processes did not enter
@@ -78,8 +78,12 @@ class InstanceGroups:
                     remove_empty(os.path.join(base, other))
 
     def prepare(self, key: Key, limits: LimitRule, *, realtime: bool) -> None:
-        """Make the group of an instance ahead of its start, for the next `make`."""
-        self._prepared[key] = limits, self.make(key, limits, realtime=realtime)
+        """Make the group of an instance ahead of its start, for the next `make`.
+
+        After a fault the next `make` tries again, because the fault may be over by then.
+        """
+        if not self.make(key, limits, realtime=realtime):
+            self._prepared[key] = limits
 
     def make(self, key: Key, limits: LimitRule, *, realtime: bool) -> dict[str, str]:
         """Make the group of an instance with its limits; return the faults by limit.
@@ -88,10 +92,9 @@ class InstanceGroups:
             realtime: leave out groups of the controller cpu of version 1, which by default allow
                 no real-time scheduling, and whose limits have no effect on it.
         """
-        made_for, faults = self._prepared.pop(key, (None, {}))
-        if made_for == limits:
-            return faults
-        faults = {}
+        if self._prepared.pop(key, None) == limits:
+            return {}
+        faults: dict[str, str] = {}
         made, is_new = [], True
         for tree in self.trees:
             if not self._needs(tree, limits, realtime=realtime):

@@ -336,6 +336,17 @@ def test_a_group_that_was_made_ahead_gets_changed_limits(tmp_path: Path) -> None
     assert (group / "memory.max").read_text() == "500000000"
 
 
+def test_a_fault_before_the_start_does_not_refuse_the_start(confinement, tmp_path) -> None:
+    """Required limits could not be set while the job was held, and can be at its start."""
+    top, limits = tmp_path / "top", LimitRule(memory=5e8, required=True)
+    top.mkdir()
+    confinement.groups = InstanceGroups([Tree(2, str(top), str(tmp_path), ("memory",))])
+    confinement.prepare(KEY, limits)  # the control files are missing
+    for file in ("memory.max", "memory.oom.group"):
+        (top / "camera.1" / file).touch()
+    assert confinement.start(KEY, limits, started).enforced == ("limits.memory",)
+
+
 def test_an_unlimited_niceness_is_not_missing(tmp_path: Path, monkeypatch) -> None:
     """`ulimit -e unlimited` is -1 to Python."""
     monkeypatch.setattr(group_trees, "_CAP_SYS_NICE", 0)
