@@ -75,10 +75,13 @@ class LogKeeper:
         self._folder = LogFolder(state)
         self._unchecked = limits.keep_bytes  # bytes that may lie there from earlier
 
-    def prepare(self, instance: Key, known: Collection[Key]) -> None:
-        """Open the log of an instance ahead of its start, for the next `open`."""
+    def prepare(self, instance: Key) -> None:
+        """Open the log of an instance ahead of its start, for the next `open`.
+
+        No older log is removed yet, because the instance may never start.
+        """
         with contextlib.suppress(OSError):  # `open` tries again, and reports the fault
-            self._prepared[instance] = self.open(instance, known)
+            self._prepared[instance] = self._open(instance)
 
     def open(self, instance: Key, known: Collection[Key]) -> int:
         """Open the log of a starting instance; make room, but keep logs of `known` instances.
@@ -86,19 +89,23 @@ class LogKeeper:
         Raises:
             OSError: the log cannot be opened. An old log that cannot be removed prevents no start.
         """
-        prepared = self._prepared.pop(instance, None)
-        if prepared is not None:
-            if os.fstat(prepared).st_nlink:
-                return prepared
-            os.close(prepared)  # a user has removed the file
-        path = paths.log_file(self._state, *instance)
-        log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-        self._opened[instance] = os.fstat(log).st_size
+        log = self._prepared.pop(instance, None)
+        if log is not None and not os.fstat(log).st_nlink:  # a user has removed the file
+            os.close(log)
+            log = None
+        if log is None:
+            log = self._open(instance)
         try:
             self._folder.add(instance, known, self.limits)
             self._folder.remove_old_processes(known, self.limits)
         except OSError as error:
             own_log.write(f"an old log cannot be removed: {error}")
+        return log
+
+    def _open(self, instance: Key) -> int:
+        path = paths.log_file(self._state, *instance)
+        log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        self._opened[instance] = os.fstat(log).st_size
         return log
 
     def note_adoption(self, instance: Key, known: Collection[Key], pid: int) -> None:

@@ -223,7 +223,7 @@ class Server:
         if key is None or key == self._prepared or launch is None:
             return
         self._prepared = key
-        self._logs.prepare(key, self._core.instances)
+        self._logs.prepare(key)
         self._confinement.prepare(key, launch.limits)
 
     def _remove_groups(self) -> None:

@@ -65,7 +65,7 @@ def test_older_files_of_running_processes_are_removed_when_nothing_else_is_left(
 def test_a_log_that_was_opened_ahead_stays(tmp_path, folder):
     """Its process is going to write into it."""
     keeper = LogKeeper(str(tmp_path), LIMITS)
-    keeper.prepare(("held", 1), ())
+    keeper.prepare(("held", 1))
     for number in range(40):
         run(keeper, (f"job{number}", 1), 900)
         keeper.release((f"job{number}", 1))
