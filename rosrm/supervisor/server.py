@@ -19,7 +19,7 @@ from typing import Final
 
 from rosrm.core.supervisor import commands, events
 from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
-from rosrm.core.supervisor.instance import STARTING, STOPPING
+from rosrm.core.supervisor.instance import BACKOFF, STARTING, STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.model import start_trace
@@ -186,7 +186,7 @@ class Server:
             self._trees.release(key)
             if instance.ended:
                 self._ended.append(key)
-            elif instance.started:  # otherwise its groups may have been made ahead
+            elif instance.started or instance.phase == BACKOFF:  # else they may be made ahead
                 self._groups.remove(key, time.monotonic())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
         status = messages.Status.of(instance)

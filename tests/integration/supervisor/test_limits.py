@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from threading import Event
@@ -13,6 +14,7 @@ import pytest
 from rosrm.core.supervisor.events import StopOrdered
 from rosrm.core.supervisor.rules import LimitRule
 from rosrm.model.values import InstanceState, Limits, RestartPolicy
+from rosrm.runtime import cgroups
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.client import SupervisorClient
 from rosrm.supervisor.instance_groups import pids, remove_empty
@@ -219,6 +221,28 @@ def test_a_held_instance_that_is_stopped_leaves_no_group(host, client, replaced:
     host.ended(client, "next")
     kill(pid)
     host.ended(client, "first")
+    wait_removed(client)
+
+
+def test_leftovers_of_a_first_start_that_failed_are_killed(host, client) -> None:
+    """Otherwise they would run beside the next attempt."""
+    pid = host.sleeper(client, "first")
+    client.start([host.order("next", "true", slots=1, restart=RestartPolicy("always", delay=60.0))])
+    host.wait(client, "next", InstanceState.HELD)
+    log, group = host.log("next"), group_of(client, "next")
+    wait_until(group.is_dir, "the group of the held instance")  # its log is made before
+    log.unlink()
+    log.mkdir()  # the start fails
+    with subprocess.Popen(["sleep", "1000"]) as leftover:
+        try:
+            cgroups.write(str(group / "cgroup.procs"), str(leftover.pid))
+            kill(pid)
+            host.wait(client, "next", InstanceState.BACKOFF)
+            assert leftover.wait(PATIENCE) == -signal.SIGKILL
+        finally:
+            leftover.kill()
+    client.send(StopOrdered(("next", 1)))
+    host.ended(client, "next")
     wait_removed(client)
 
 
