@@ -107,9 +107,9 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
     """
     here, there, spec = move.source_host, move.destination_host, move.spec
     start = options.start_timeout
-    until_dumped = start + options.leave_timeout + options.dump_timeout
+    until_dumped = 2 * start + options.leave_timeout + options.dump_timeout
     seconds = {
-        "leave": options.leave_timeout, "dump": options.dump_timeout,
+        "leave": options.leave_timeout, "dump": options.dump_timeout, "compare": start,
         "offer": options.transfer_timeout + start,
     }  # fmt: skip
     return Plan(

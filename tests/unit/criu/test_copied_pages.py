@@ -12,7 +12,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import copied_pages, memory_copy, protobuf
+from rosrm_criu.engine import copied_pages, image, memory_copy, protobuf
 from rosrm_criu.engine.copied_pages import Entry, Pagemap
 from rosrm_criu.engine.image import PAGES, PARENT
 from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
@@ -80,17 +80,21 @@ def restored(images: Path) -> dict[int, bytes]:
 @example(FULL, FULL)
 @example(FULL, {**FULL, 3: 2, 64: 2})
 def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before, after):
-    """Pages may be mapped, unmapped or written after the copy; only the changed ones are sent."""
+    """Pages may be mapped, unmapped or written after the copy; only the changed ones are sent.
+
+    A dump with few equal pages is sent whole.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         copy = dump_after_copy(folder, before, after)
-        sizes = copied_pages.remove_copied_pages(folder, copy)
+        sizes = copied_pages.remove_copied_pages(folder, copy, lambda: None)
         sent = (folder / PAGES / "pages-1.img").stat().st_size // PAGE
         copied_pages.move_into_parent(folder, copy.directory)
         expected = {page: content(number) for page, number in after.items()}
-        if before:
-            assert restored(folder / PAGES) == expected
-            assert sent == sum(before.get(page) != number for page, number in after.items())
+        changed = sum(before.get(page) != number for page, number in after.items())
+        assert restored(folder / PAGES) == expected
+        if before and (len(after) - changed) * 8 >= len(after):
+            assert sent == changed
             assert sizes == {f"{PARENT}/{file_name(PID)}": len(before) * PAGE}
         else:
             assert sent == len(after)
@@ -120,8 +124,37 @@ def test_a_dump_of_an_unknown_form_stays_as_it_is(tmp_path, change):
     pagemap.write_bytes(change(pagemap.read_bytes()))
     before = {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()}
     with pytest.raises((ValueError, KeyError)):
-        copied_pages.remove_copied_pages(tmp_path, copy)
+        copied_pages.remove_copied_pages(tmp_path, copy, lambda: None)
     assert {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()} == before
+
+
+def test_a_comparison_can_be_ended(tmp_path):
+    """The whole dump can be sent then."""
+    copy = dump_after_copy(tmp_path, FULL, FULL)
+    before = {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()}
+
+    def too_late() -> None:
+        raise ValueError("it is too late")
+
+    with pytest.raises(ValueError, match="too late"):
+        copied_pages.remove_copied_pages(tmp_path, copy, too_late)
+    assert {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()} == before
+
+
+def test_copies_that_the_dump_does_not_use_stay_out_of_the_image(tmp_path):
+    """A small child has no copied pages; another child has ended before the dump."""
+    copy = dump_after_copy(tmp_path, FULL, FULL)
+    images = tmp_path / PAGES
+    for small in ("pagemap-8.img", "pages-2.img"):
+        (images / small).write_bytes(b"of a small child")
+    for pid, pages in ((8, 0), (9, 1)):
+        write_pages(copy.directory / file_name(pid), dict.fromkeys(range(pages), 1))
+    ranges = {**copy.ranges, 8: [], 9: ranges_of({0: 1})}
+    found = MemoryCopy(copy.directory, ranges)
+    sizes = copied_pages.remove_copied_pages(tmp_path, found, lambda: None)
+    named = {**image.file_sizes(tmp_path), **sizes}
+    copied_pages.move_into_parent(tmp_path, copy.directory)
+    assert image.file_sizes(tmp_path) == named
 
 
 # --- the copy ---------------------------------------------------------------------------------

@@ -7,11 +7,12 @@ if all their bytes are, so the kernel need not track written pages.
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import struct
 from bisect import bisect_right
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
@@ -27,8 +28,11 @@ from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
 #: Flags of CRIU's pagemap_entry: PE_PARENT (the pages are in the parent image), PE_PRESENT (the
 #: pages are in the file of pages), PE_LAZY (they may be restored on their first use).
 _IN_PARENT, _PRESENT, _LAZY = 1, 4, 2
-#: Pages that are compared at once, so that the results stay in the processor's cache.
-_AT_ONCE: Final = 64
+#: Most pages that are compared or written between two calls of `check`.
+_AT_ONCE: Final = 16384
+#: A dump with fewer equal pages than one of so many stays whole, because it is sent sooner so.
+_LEAST_EQUAL: Final = 8
+_PAGE: Final = np.dtype((np.void, PAGE))
 _NEW: Final = ".new"
 #: Name of a file with copied pages.
 _COPY: Final = re.compile(r"pages-\d+\.img", re.ASCII)
@@ -105,12 +109,18 @@ def _numbers(message: bytes, known: Collection[int]) -> dict[int, int]:
     return values
 
 
-def remove_copied_pages(directory: Path, copy: MemoryCopy) -> dict[str, int]:
+def remove_copied_pages(
+    directory: Path, copy: MemoryCopy, check: Callable[[], None]
+) -> dict[str, int]:
     """Remove the pages from a dump that are equal in a copy, and mark them as in the parent.
+
+    The former files of pages stay in the directory of the copy until that is removed. To free them
+    takes a while, and the node is frozen.
 
     Args:
         directory: of the image.
         copy: of the same processes.
+        check: called again and again; may raise an error to end the comparison.
 
     Returns:
         The bytes of each file that must be in the image before a restore, by path below it.
@@ -122,11 +132,10 @@ def remove_copied_pages(directory: Path, copy: MemoryCopy) -> dict[str, int]:
     images, parent = directory / PAGES, directory / PARENT
     parent.mkdir(mode=0o700)
     try:
-        sizes = {
-            f"{PARENT}/{file_name(pid)}": _prepare(images, parent, copy, pid)
-            for pid, ranges in copy.ranges.items()
-            if ranges and (images / f"pagemap-{pid}.img").exists()
-        }
+        sizes: dict[str, int] = {}
+        for pid, ranges in copy.ranges.items():
+            if ranges and (images / f"pagemap-{pid}.img").exists():
+                sizes |= _prepare(images, parent, copy, pid, check)
     except BaseException:
         shutil.rmtree(parent)
         for path in images.glob(f"*{_NEW}"):
@@ -137,41 +146,47 @@ def remove_copied_pages(directory: Path, copy: MemoryCopy) -> dict[str, int]:
     return sizes
 
 
-def _prepare(images: Path, parent: Path, copy: MemoryCopy, pid: int) -> int:
-    """Write the new files of one process; return the bytes of its copied pages."""
+def _prepare(
+    images: Path, parent: Path, copy: MemoryCopy, pid: int, check: Callable[[], None]
+) -> dict[str, int]:
+    """Write the new files of one process; return the bytes of the files of its copied pages."""
     name, ranges = f"pagemap-{pid}.img", copy.ranges[pid]
     pagemap = Pagemap.decoded((images / name).read_bytes())
     pages = f"pages-{pagemap.file}.img"
     dumped, before = _pages(images / pages), _pages(copy.directory / file_name(pid))
-    same = same_pages([one.page_range for one in pagemap.entries], ranges, dumped, before)
+    same = same_pages([one.page_range for one in pagemap.entries], ranges, dumped, before, check)
+    if same.sum() * _LEAST_EQUAL < len(same):
+        return {}
     entries = list(split_entries(pagemap.entries, same))
     _write(images / f"{name}{_NEW}", [Pagemap(pagemap.magic, pagemap.file, entries).encoded()])
-    _write(images / f"{pages}{_NEW}", _changed(entries, dumped))
+    _write(images / f"{pages}{_NEW}", _changed(entries, dumped, check))
     own = Pagemap(pagemap.magic, pid, [Entry(one, _PRESENT) for one in ranges])
     _write(parent / name, [own.encoded()])
-    return before.nbytes
+    os.link(images / pages, copy.directory / f"dumped-{pages}")
+    return {f"{PARENT}/{file_name(pid)}": before.nbytes}
 
 
-def _pages(path: Path) -> NDArray[np.uint64]:
-    """Return the pages of a file as a matrix, one page in each row."""
-    size = path.stat().st_size
-    flat = np.asarray(np.memmap(path, np.uint64, "r")) if size else np.empty(0, np.uint64)
-    return flat.reshape(-1, PAGE // 8)
+def _pages(path: Path) -> NDArray[np.void]:
+    """Return the pages of a file; two of them are equal if all their bytes are."""
+    empty = path.stat().st_size == 0
+    return np.empty(0, _PAGE) if empty else np.asarray(np.memmap(path, _PAGE, "r"))
 
 
 def same_pages(
     dumped: Iterable[PageRange],
     copied: Sequence[PageRange],
-    pages: NDArray[np.uint64],
-    copy: NDArray[np.uint64],
+    pages: NDArray[np.void],
+    copy: NDArray[np.void],
+    check: Callable[[], None],
 ) -> NDArray[np.bool_]:
     """Return the mask of the dumped pages that are equal to the copied page of the same address.
 
     Args:
         dumped: ranges of the dump, in the order of its pages.
         copied: ranges of the copy, in the order of its pages and by ascending address.
-        pages: of the dump, one in each row.
-        copy: the copied pages, one in each row.
+        pages: of the dump.
+        copy: the copied pages.
+        check: called again and again; may raise an error.
 
     Raises:
         ValueError: the number of pages is not that of the ranges.
@@ -187,9 +202,10 @@ def same_pages(
             there = rows[at] + (low - copied[at].begin) // PAGE
             begin, end = row + (low - one.begin) // PAGE, row + (high - one.begin) // PAGE
             for here in range(begin, end, _AT_ONCE):
+                check()
                 after = min(here + _AT_ONCE, end)
                 part = copy[there + here - begin : there + after - begin]
-                same[here:after] = (pages[here:after] == part).all(axis=1)
+                same[here:after] = pages[here:after] == part
             at += 1
         row += one.pages
     if (row, rows[-1]) != (len(pages), len(copy)):
@@ -210,13 +226,17 @@ def split_entries(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator
         row += pages
 
 
-def _changed(entries: Iterable[Entry], pages: NDArray[np.uint64]) -> Iterator[memoryview]:
+def _changed(
+    entries: Iterable[Entry], pages: NDArray[np.void], check: Callable[[], None]
+) -> Iterator[memoryview]:
     """Yield the pages that are not in the parent."""
     row = 0
     for one, flags in entries:
-        if flags != _IN_PARENT:
-            yield pages[row : row + one.pages].data
-        row += one.pages
+        after = row + one.pages
+        for begin in range(row, after if flags != _IN_PARENT else row, _AT_ONCE):
+            check()
+            yield pages[begin : min(begin + _AT_ONCE, after)].data
+        row = after
 
 
 def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
@@ -227,11 +247,14 @@ def _write(path: Path, pieces: Iterable[bytes | memoryview]) -> None:
 
 
 def move_into_parent(directory: Path, copies: Path) -> None:
-    """Move received copies into the parent of a received image, if it has one; raise OSError."""
+    """Move received copies into the parent of a received image, if it has one; raise OSError.
+
+    The copies of processes without pages in the parent stay: small ones, and those that have ended.
+    """
     parent = directory / PARENT
-    if parent.is_dir():
-        for path in copies.iterdir():
-            path.rename(parent / path.name)
+    for pagemap in parent.glob("pagemap-*.img"):
+        name = pagemap.name.replace("pagemap", "pages")
+        (copies / name).rename(parent / name)
 
 
 def has_only_copied_pages(directory: Path) -> bool:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
+import time
+import uuid
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,6 +29,8 @@ from rosrm_criu.transfer import Offer, Sender
 
 #: Minimum bytes of memory for a copy. Less memory is dumped, sent and restored within a second.
 LEAST: Final = 64 << 20
+#: First part of the names of copies that are being removed.
+_UNUSED: Final = ".unused-copy-"
 
 
 @dataclass(frozen=True)
@@ -134,18 +138,39 @@ def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) 
 
     Returns:
         True if the dump now refers to the copy; False: it is as before.
+
+    Raises:
+        CriuError: the attempt was given up.
     """
     with _changing:
         sent = _sent.get(asked.source)
     if sent is None or sent.offer != asked.results[INTRODUCE].get("copy"):
         return False
     try:
-        copied = copied_pages.remove_copied_pages(directory, sent.copy)
+        check = _check_until(asked.attempt, float(asked.arguments["seconds"]["compare"]))
+        copied = copied_pages.remove_copied_pages(directory, sent.copy, check)
     except (OSError, ValueError, KeyError):  # the whole dump is sent
         return False
     sizes = {**image.file_sizes(directory), **copied}
     image.write(directory, replace(manifest, sizes=sizes))
     return True
+
+
+def _check_until(attempt: str, seconds: float) -> Callable[[], None]:
+    """Return a function that raises CriuError if the attempt was given up, ValueError if it is late.
+
+    Args:
+        attempt: id of the migration attempt.
+        seconds: from now on.
+    """
+    deadline = time.monotonic() + seconds
+
+    def check() -> None:
+        attempts.check_wanted(attempt)
+        if time.monotonic() > deadline:
+            raise ValueError(f"it has taken longer than {seconds:g} s")
+
+    return check
 
 
 def remove_sent_copy(state: Path, number: int, only: _Sent | None = None) -> None:
@@ -161,7 +186,8 @@ def remove_sent_copy(state: Path, number: int, only: _Sent | None = None) -> Non
         if only not in (None, sent):
             return
         _sent.pop(number, None)
-        artifacts.discard(sent_copy(state, number))
+        renamed = _renamed(sent_copy(state, number))
+    artifacts.discard(renamed)
     if sent is not None:
         sent.sender.close()
 
@@ -236,7 +262,8 @@ def remove_received_copy(state: Path, number: int, only: str = "") -> None:
         if only and _received.get(number) != only:
             return
         _received.pop(number, None)
-    artifacts.discard(received_copy(state, number))
+        renamed = _renamed(received_copy(state, number))
+    artifacts.discard(renamed)
 
 
 # --- both -------------------------------------------------------------------------------------
@@ -247,7 +274,20 @@ def sweep(state: Path) -> None:
     with _changing:
         for number in numbers(state, "copy-out"):
             if number not in _sent:
-                artifacts.discard(sent_copy(state, number))
+                _renamed(sent_copy(state, number))
         for number in numbers(state, "copy-in"):
             if number not in _received:
-                artifacts.discard(received_copy(state, number))
+                _renamed(received_copy(state, number))
+    for directory in (state / "images").glob(f"{_UNUSED}*"):
+        artifacts.discard(directory)
+
+
+def _renamed(directory: Path) -> Path:
+    """Return the new path of a copy, if there is one, whose name is free from now on.
+
+    Its removal takes a while, and may not hold the lock that the dump of a frozen node needs.
+    """
+    renamed = directory.with_name(f"{_UNUSED}{uuid.uuid4().hex}")
+    with contextlib.suppress(FileNotFoundError):
+        directory.rename(renamed)
+    return renamed
