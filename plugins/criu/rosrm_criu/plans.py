@@ -33,6 +33,7 @@ MEASURE_MEMORY: Final = "criu_measure_memory"
 EXPECT_COPY: Final = "criu_expect_copy"
 COPY_MEMORY: Final = "criu_copy_memory"
 FETCH_COPY: Final = "criu_fetch_copy"
+REMOVE_COPY: Final = "criu_remove_copy"
 INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
 GO_ON: Final = "criu_go_on"
@@ -97,9 +98,9 @@ def suspend(move: Move, seconds: float) -> SetRestart:
 def move_plan(move: Move, options: CriuOptions) -> Plan:
     """Return a plan: copy, freeze, dump, fetch, restore, commit, join, end the source.
 
-    The copy, the preparation of the destination and the fetch have no undo, because an undo would
-    wait for a host that may be lost, and the source would wait too. Each is cleaned up after a
-    timeout.
+    The preparation of the destination and the fetch have no undo, because an undo would wait for a
+    host that may be lost, and the source would wait too. Each is cleaned up after a timeout. The
+    undo of the copy comes last, when the source runs again.
 
     Args:
         move: of a portable node, to another host.
@@ -114,8 +115,8 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
     }  # fmt: skip
     return Plan(
         (
-            suspend(move, start),
             *_precopy(move, options, keep=until_dumped + options.transfer_timeout + 4 * start),
+            suspend(move, start),
             execute(
                 move, there, INTRODUCE, start, keep=until_dumped + 2 * start,
                 working_directory=spec.working_directory,
@@ -157,12 +158,20 @@ def _precopy(move: Move, options: CriuOptions, keep: float) -> tuple[Execute, ..
     longest = options.transfer_timeout
     return (
         execute(move, here, MEASURE_MEMORY, start),
-        execute(move, there, EXPECT_COPY, start, keep=longest + 2 * start),
+        # Its undo is that of the next step. No step at the source may have an undo before the node
+        # is frozen, because the blackout counts from the first such step.
+        execute(
+            move, there, EXPECT_COPY, start, keep=longest + 2 * start,
+            undo=execute(move, here, REMOVE_COPY, start),
+        ),
         execute(
             move, here, COPY_MEMORY, longest, offer=longest + start, keep=longest + keep,
             max_rate=options.max_rate,
         ),
-        execute(move, there, FETCH_COPY, longest, reserve=options.reserve, keep=keep),
+        execute(
+            move, there, FETCH_COPY, longest, reserve=options.reserve, keep=keep,
+            undo=execute(move, there, REMOVE_COPY, start),
+        ),
     )  # fmt: skip
 
 

@@ -28,6 +28,7 @@ EXECUTORS: Final = {
     plans.EXPECT_COPY: "precopy.expect_copy",
     plans.COPY_MEMORY: "precopy.copy_memory",
     plans.FETCH_COPY: "precopy.fetch_copy",
+    plans.REMOVE_COPY: "precopy.remove_copy",
     plans.INTRODUCE: "move.introduce",
     plans.CHECKPOINT: "move.checkpoint",
     plans.GO_ON: "move.go_on",

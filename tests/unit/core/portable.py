@@ -25,11 +25,13 @@ from rosrm_criu.plans import (
     INTRODUCE,
     JOIN,
     MEASURE_MEMORY,
+    REMOVE_COPY,
 )
 from rosrm_criu.strategy import Criu
 from tests.unit.core.machine import Machine
 from tests.unit.core.nodes import Node
 
+_OF_THE_COPY = (MEASURE_MEMORY, EXPECT_COPY, COPY_MEMORY, FETCH_COPY, REMOVE_COPY)
 _ALIKE = {name: "yes" if name == "all_users" else "4.2" for name in FACTS}
 
 
@@ -73,7 +75,7 @@ class Portable(Machine):
             HOST_CHECK: lambda _: _ALIKE, INTRODUCE: lambda _: {}, FETCH: lambda _: {},
             CHECKPOINT: self._checkpoint, GO_ON: self._go_on, END: self._end_source,
             AWAIT_RESTORED: self._await_restored, JOIN: self._join,
-            **dict.fromkeys((MEASURE_MEMORY, EXPECT_COPY, COPY_MEMORY, FETCH_COPY), lambda _: {}),
+            **dict.fromkeys(_OF_THE_COPY, lambda _: {}),
         }  # fmt: skip
 
     def obey(self, sent: SendOrder, now: float) -> happened.OrderAnswered:

@@ -54,8 +54,10 @@ class Steps:
         }  # fmt: skip
 
     def call(self, name: str, step, **changes):
-        self.results[name] = step(self.arguments(**changes))
-        return self.results[name]
+        answer = step(self.arguments(**changes))
+        if answer:  # the master keeps no empty result
+            self.results[name] = answer
+        return answer
 
     def until_offered(self) -> None:
         self.call(MEASURE_MEMORY, precopy.measure_memory)
@@ -102,7 +104,7 @@ def test_little_memory_is_not_copied(tmp_path):
     """No process is started for it, and nothing is written."""
     steps = Steps(tmp_path, size=1 << 20)
     steps.until_offered()
-    assert steps.results == {MEASURE_MEMORY: {"bytes": 0}, EXPECT_COPY: {}, COPY_MEMORY: {}}
+    assert steps.results == {MEASURE_MEMORY: {"bytes": 0}}
     assert steps.fetch() == {}
     steps.close()
     assert not list(tmp_path.iterdir())
@@ -125,6 +127,27 @@ def test_a_process_that_has_ended_is_no_failure(steps):
     assert f"p#{steps.number} does not run on h" in answer["skipped"]
     assert steps.fetch() == {}
     assert not sent_copy(steps.folder, steps.number).exists()
+
+
+def test_a_copy_that_is_undone_while_it_is_under_way_is_given_up(steps):
+    """The source does not offer it, and keeps no part of it."""
+    steps.call(MEASURE_MEMORY, precopy.measure_memory)
+    steps.call(EXPECT_COPY, precopy.expect_copy)
+    precopy.remove_copy(steps.arguments())
+    assert "was undone" in steps.call(COPY_MEMORY, precopy.copy_memory)["skipped"]
+    assert not list((steps.folder / "images").iterdir())
+
+
+@pytest.mark.parametrize("fetched", [False, True])
+def test_an_undone_copy_leaves_nothing(steps, fetched):
+    """The undo removes it at both ends, with the end that would receive it."""
+    steps.until_offered()
+    if fetched:
+        assert steps.fetch()["received"] > 0
+    precopy.remove_copy(steps.arguments())
+    assert not list((steps.folder / "images").iterdir())
+    assert steps.received == ""
+    assert artifacts.take_fetcher(steps.number) is None
 
 
 def test_a_source_that_withdraws_its_copy_is_no_failure(steps):

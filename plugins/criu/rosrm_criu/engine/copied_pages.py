@@ -21,6 +21,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from rosrm.errors import CriuError
 from rosrm_criu.engine import protobuf
 from rosrm_criu.engine.image import PAGES, PARENT
 from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
@@ -257,6 +258,8 @@ def move_into_parent(directory: Path, copies: Path) -> None:
         (copies / name).rename(parent / name)
 
 
-def has_only_copied_pages(directory: Path) -> bool:
-    """Return True if a received directory contains copied pages alone."""
-    return all(path.is_file() and _COPY.fullmatch(path.name) for path in directory.iterdir())
+def check_files(directory: Path) -> None:
+    """Raise CriuError if a received directory contains anything but copied pages."""
+    for path in directory.iterdir():
+        if not (path.is_file() and _COPY.fullmatch(path.name)):
+            raise CriuError("the copy contains other files than pages-PID.img: refused")

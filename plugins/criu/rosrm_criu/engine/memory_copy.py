@@ -9,15 +9,13 @@ from __future__ import annotations
 import mmap
 import os
 import re
-import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from rosrm.errors import CriuError
 from rosrm.supervisor.procfs import inner_pid
 
 PAGE: Final = mmap.PAGESIZE
@@ -74,26 +72,22 @@ def size_of(pids: Iterable[int]) -> int:
     return sum(anonymous for pid in pids for _, _, anonymous in _areas(pid))
 
 
-def copy(pids: Iterable[int], directory: Path, timeout: float) -> MemoryCopy:
+def copy(pids: Iterable[int], directory: Path, check: Callable[[], None]) -> MemoryCopy:
     """Copy the memory of running processes.
 
     Args:
         pids: of the processes.
         directory: a new one.
-        timeout: seconds.
+        check: called again and again; may raise an error to end the copy.
 
     Raises:
-        CriuError: the copy took longer than `timeout`.
         OSError: a process has ended, its memory may not be read, or the disk is full.
     """
-    deadline = time.monotonic() + timeout
     directory.mkdir(mode=0o700, parents=True)
-    return MemoryCopy(
-        directory, {inner_pid(pid): _copy_one(pid, directory, deadline) for pid in pids}
-    )
+    return MemoryCopy(directory, {inner_pid(pid): _copy_one(pid, directory, check) for pid in pids})
 
 
-def _copy_one(pid: int, directory: Path, deadline: float) -> list[PageRange]:
+def _copy_one(pid: int, directory: Path, check: Callable[[], None]) -> list[PageRange]:
     path = directory / file_name(inner_pid(pid))
     path.touch(mode=0o600, exist_ok=False)
     copied: list[PageRange] = []
@@ -106,8 +100,7 @@ def _copy_one(pid: int, directory: Path, deadline: float) -> list[PageRange]:
             for found in _held(pagemap.fileno(), begin, end):
                 size = 0
                 for piece in _pieces(memory.fileno(), found):
-                    if time.monotonic() > deadline:
-                        raise CriuError("the memory could not be copied in time")
+                    check()
                     file.write(piece)
                     size += len(piece)
                 if size:

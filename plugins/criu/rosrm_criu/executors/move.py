@@ -106,8 +106,6 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         finally:  # afterwards, because the end of the sender takes a while
             artifacts.withdraw(asked.state, asked.source)
         raise
-    finally:  # in the background, because the node is frozen
-        artifacts.call_later(0.0, precopy.remove_sent_copy, asked.state, asked.source)
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
         "seconds": {
@@ -154,6 +152,7 @@ def end(arguments: Answer) -> Answer:
         # If both hosts share the directory, its status already says that the node runs.
         if status is not None and status.state is State.LEFT:
             remove_directory(control)
+    artifacts.call_later(0.0, precopy.remove_sent_copy, asked.state, asked.source)
     return {}
 
 

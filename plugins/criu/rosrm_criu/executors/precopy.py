@@ -101,7 +101,7 @@ def measure_memory(asked: StepArguments) -> Answer:
 @_optional(COPY_MEMORY)
 def copy_memory(asked: StepArguments) -> Answer:
     """Copy the memory of the running node, and offer the copy."""
-    to = asked.results[EXPECT_COPY].get("certificate")
+    to = asked.answer_of(EXPECT_COPY).get("certificate")
     if not to:
         return {}
     remove_sent_copy(asked.state, asked.source)
@@ -110,18 +110,20 @@ def copy_memory(asked: StepArguments) -> Answer:
     try:
         # Half of the timeout, because the sender must start after the copy and before the step
         # times out.
-        copy = memory_copy.copy(_pids(asked), directory, asked.timeout / 2)
+        check = _check_until(asked.attempt, asked.timeout / 2)
+        copy = memory_copy.copy(_pids(asked), directory, check)
         offer = sender.offer(
             directory, seconds=float(asked.arguments["offer"]), to=str(to),
             max_rate=float(asked.arguments["max_rate"]),
         )  # fmt: skip
+        sent = _Sent(copy, offer.fingerprint, sender)
+        with _changing:
+            attempts.check_wanted(asked.attempt)
+            _sent[asked.source] = sent
     except BaseException:  # any error: no other code would close this end
         sender.close()
         artifacts.discard(directory)
         raise
-    sent = _Sent(copy, offer.fingerprint, sender)
-    with _changing:
-        _sent[asked.source] = sent
     artifacts.call_later(
         float(asked.arguments["keep"]), remove_sent_copy, asked.state, asked.source, sent
     )
@@ -157,18 +159,18 @@ def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) 
 
 
 def _check_until(attempt: str, seconds: float) -> Callable[[], None]:
-    """Return a function that raises CriuError if the attempt was given up, ValueError if it is late.
+    """Return a check of a copy or comparison under way.
 
     Args:
-        attempt: id of the migration attempt.
-        seconds: from now on.
+        attempt: id of the migration attempt; if it was given up, the check raises CriuError.
+        seconds: after which the check raises ValueError.
     """
     deadline = time.monotonic() + seconds
 
     def check() -> None:
         attempts.check_wanted(attempt)
         if time.monotonic() > deadline:
-            raise ValueError(f"it has taken longer than {seconds:g} s")
+            raise ValueError(f"the copy is given up: it has taken longer than {seconds:g} s")
 
     return check
 
@@ -202,7 +204,7 @@ def _pids(asked: StepArguments) -> Sequence[int]:
 @_optional(EXPECT_COPY)
 def expect_copy(asked: StepArguments) -> Answer:
     """Open the receiving end for the copy, unless the source will send none."""
-    if not asked.results[MEASURE_MEMORY].get("bytes"):
+    if not asked.answer_of(MEASURE_MEMORY).get("bytes"):
         return {}
     keep = float(asked.arguments["keep"])
     return {"certificate": artifacts.open_fetcher(asked.destination, keep)}
@@ -211,9 +213,10 @@ def expect_copy(asked: StepArguments) -> Answer:
 @_optional(FETCH_COPY)
 def fetch_copy(asked: StepArguments) -> Answer:
     """Fetch the copy, if there is room for the whole dump beside it."""
-    if "offer" not in asked.results[COPY_MEMORY]:
+    copied = asked.answer_of(COPY_MEMORY)
+    if "offer" not in copied:
         return {}
-    offer = Offer.from_json(asked.results[COPY_MEMORY]["offer"])
+    offer = Offer.from_json(copied["offer"])
     directory = received_copy(asked.state, asked.destination)
     remove_received_copy(asked.state, asked.destination)
     fetcher = artifacts.take_fetcher(asked.destination)
@@ -224,11 +227,14 @@ def fetch_copy(asked: StepArguments) -> Answer:
         fetched = fetcher.fetch(offer, directory, timeout=asked.timeout, reserve=reserve)
     finally:
         artifacts.close_soon(fetcher)
-    if not copied_pages.has_only_copied_pages(directory):
+    try:
+        copied_pages.check_files(directory)
+        with _changing:
+            attempts.check_wanted(asked.attempt)
+            _received[asked.destination] = offer.fingerprint
+    except CriuError:
         artifacts.discard(directory)
-        raise CriuError("the copy contains other files than pages-PID.img: refused")
-    with _changing:
-        _received[asked.destination] = offer.fingerprint
+        raise
     keep = float(asked.arguments["keep"])
     artifacts.call_later(
         keep, remove_received_copy, asked.state, asked.destination, offer.fingerprint
@@ -267,6 +273,17 @@ def remove_received_copy(state: Path, number: int, only: str = "") -> None:
 
 
 # --- both -------------------------------------------------------------------------------------
+
+
+def remove_copy(arguments: Answer) -> Answer:
+    """Undo a copy at the source or at the destination; one that is under way is given up."""
+    asked = StepArguments.of(arguments)
+    attempts.turn_back(asked.attempt)
+    remove_sent_copy(asked.state, asked.source)
+    remove_received_copy(asked.state, asked.destination)
+    if fetcher := artifacts.take_fetcher(asked.destination):
+        fetcher.close()
+    return {}
 
 
 def sweep(state: Path) -> None:

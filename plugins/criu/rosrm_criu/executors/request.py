@@ -56,6 +56,10 @@ class StepArguments:
             arguments,
         )  # fmt: skip
 
+    def answer_of(self, step: str) -> Mapping[str, Any]:
+        """Return the result of an earlier step; the master leaves out empty results."""
+        return self.results.get(step, {})
+
     def pid(self, number: int) -> int:
         """Return the pid of the leader of an instance that lives here; 0: there is none."""
         pid = self.pids.get(f"{self.process}#{number}", 0)
