@@ -72,13 +72,25 @@ while True:
 # --- what continues -----------------------------------------------------------------------------
 
 
-def test_a_process_is_restored_from_a_copy_and_its_later_changes(theatre):
-    """CRIU reads pages that were equal in the dump from the copy, which was made before."""
+@pytest.mark.parametrize("again", [False, True])
+@pytest.mark.parametrize("changes", [0, 1])
+def test_a_process_is_restored_from_a_copy_and_its_later_changes(theatre, again, changes):
+    """CRIU reads pages that were equal in the dump from the copies, which were made before.
+
+    What has changed since the first copy is copied again, or left to the dump. The second change
+    is back to the first content.
+    """
     actor = theatre.start(CHANGER)
     actor.says("ready")
     copy = memory_copy.copy([actor.pid], theatre.folder / "copy", lambda: None)
     os.kill(actor.pid, signal.SIGUSR1)
-    actor.says("changed")
+    eventually(lambda: actor.lines().count("changed\n") == 1, "a change")
+    if again:
+        copy = memory_copy.copy_changes(copy, [actor.pid], lambda: None)
+        assert (copy.directory / "changes").exists()
+    if changes:
+        os.kill(actor.pid, signal.SIGUSR1)
+        eventually(lambda: actor.lines().count("changed\n") == 2, "another change")
     os.kill(actor.pid, signal.SIGUSR2)
     eventually(actor.numbers, "a checksum")
     directory = theatre.dump(actor)

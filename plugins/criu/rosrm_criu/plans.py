@@ -33,6 +33,8 @@ MEASURE_MEMORY: Final = "criu_measure_memory"
 EXPECT_COPY: Final = "criu_expect_copy"
 COPY_MEMORY: Final = "criu_copy_memory"
 FETCH_COPY: Final = "criu_fetch_copy"
+COPY_CHANGES: Final = "criu_copy_changes"
+FETCH_CHANGES: Final = "criu_fetch_changes"
 REMOVE_COPY: Final = "criu_remove_copy"
 INTRODUCE: Final = "criu_introduce"
 CHECKPOINT: Final = "criu_checkpoint"
@@ -147,7 +149,8 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
 def _precopy(move: Move, options: CriuOptions, keep: float) -> tuple[Execute, ...]:
     """Return the steps that copy the memory of the running node to the destination.
 
-    They succeed without a copy too: then the whole dump is sent.
+    The first copy takes long; what the node has written meanwhile is copied once more. All steps
+    succeed without a copy too: then the whole dump is sent.
 
     Args:
         move: of a portable node.
@@ -156,6 +159,7 @@ def _precopy(move: Move, options: CriuOptions, keep: float) -> tuple[Execute, ..
     """
     here, there, start = move.source_host, move.destination_host, options.start_timeout
     longest = options.transfer_timeout
+    offer = longest + start
     return (
         execute(move, here, MEASURE_MEMORY, start),
         # Its undo is that of the next step. No step at the source may have an undo before the node
@@ -165,13 +169,18 @@ def _precopy(move: Move, options: CriuOptions, keep: float) -> tuple[Execute, ..
             undo=execute(move, here, REMOVE_COPY, start),
         ),
         execute(
-            move, here, COPY_MEMORY, longest, offer=longest + start, keep=longest + keep,
+            move, here, COPY_MEMORY, longest, offer=offer, keep=3 * longest + keep,
             max_rate=options.max_rate,
         ),
         execute(
-            move, there, FETCH_COPY, longest, reserve=options.reserve, keep=keep,
+            move, there, FETCH_COPY, longest, reserve=options.reserve, keep=2 * longest + keep,
             undo=execute(move, there, REMOVE_COPY, start),
         ),
+        execute(
+            move, here, COPY_CHANGES, longest, offer=offer, keep=longest + keep,
+            max_rate=options.max_rate,
+        ),
+        execute(move, there, FETCH_CHANGES, longest, reserve=options.reserve, keep=keep),
     )  # fmt: skip
 
 

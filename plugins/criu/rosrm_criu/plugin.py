@@ -28,6 +28,8 @@ EXECUTORS: Final = {
     plans.EXPECT_COPY: "precopy.expect_copy",
     plans.COPY_MEMORY: "precopy.copy_memory",
     plans.FETCH_COPY: "precopy.fetch_copy",
+    plans.COPY_CHANGES: "precopy.copy_changes",
+    plans.FETCH_CHANGES: "precopy.fetch_changes",
     plans.REMOVE_COPY: "precopy.remove_copy",
     plans.INTRODUCE: "move.introduce",
     plans.CHECKPOINT: "move.checkpoint",

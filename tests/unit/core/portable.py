@@ -15,10 +15,12 @@ from rosrm_criu.options import CriuOptions
 from rosrm_criu.plans import (
     AWAIT_RESTORED,
     CHECKPOINT,
+    COPY_CHANGES,
     COPY_MEMORY,
     END,
     EXPECT_COPY,
     FETCH,
+    FETCH_CHANGES,
     FETCH_COPY,
     GO_ON,
     HOST_CHECK,
@@ -31,7 +33,9 @@ from rosrm_criu.strategy import Criu
 from tests.unit.core.machine import Machine
 from tests.unit.core.nodes import Node
 
-_OF_THE_COPY = (MEASURE_MEMORY, EXPECT_COPY, COPY_MEMORY, FETCH_COPY, REMOVE_COPY)
+_OF_THE_COPY = (
+    MEASURE_MEMORY, EXPECT_COPY, COPY_MEMORY, FETCH_COPY, COPY_CHANGES, FETCH_CHANGES, REMOVE_COPY,
+)  # fmt: skip
 _ALIKE = {name: "yes" if name == "all_users" else "4.2" for name in FACTS}
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from rosrm_criu.engine import copied_pages, image, memory_copy, protobuf
 from rosrm_criu.engine.copied_pages import Entry, Pagemap
-from rosrm_criu.engine.image import PAGES, PARENT
-from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
+from rosrm_criu.engine.image import GRANDPARENT, PAGES, PARENT
+from rosrm_criu.engine.memory_copy import CHANGES, PAGE, MemoryCopy, PageRange, file_name
 
 PID = 7
 IN_PARENT, PRESENT = 1, 4
@@ -58,17 +60,30 @@ def dump_after_copy(folder: Path, before: dict[int, int], after: dict[int, int])
     return MemoryCopy(copies, {PID: ranges_of(before)})
 
 
+def copied_again(
+    copy: MemoryCopy, before: dict[int, int], between: dict[int, int]
+) -> tuple[MemoryCopy, dict[int, int]]:
+    """Return a copy with a second one of the pages that have changed, and what both contain."""
+    pages = sorted(before)
+    marks = [between.get(page, before[page]) != before[page] for page in pages]
+    newer = {page: between[page] for page, mark in zip(pages, marks, strict=True) if mark}
+    (copy.directory / CHANGES).mkdir()
+    write_pages(copy.directory / CHANGES / file_name(PID), newer)
+    return replace(copy, changed={PID: np.array(marks, np.bool_)}), {**before, **newer}
+
+
 def restored(images: Path) -> dict[int, bytes]:
     """Return the pages of an image as CRIU reads them: marked ones from the parent."""
     head, *entries = protobuf.messages((images / f"pagemap-{PID}.img").read_bytes())
     (number,) = (one.value for one in protobuf.fields(head))
     pages = (images / f"pages-{number}.img").read_bytes()
+    parent = restored(images / "parent") if (images / "parent").exists() else {}
     found: dict[int, bytes] = {}
     for entry in entries:
         values = {one.number: int(one.value) for one in protobuf.fields(entry)}
         for page in range(values[1] // PAGE, values[1] // PAGE + values[5]):
             if values[4] == IN_PARENT:
-                found[page] = restored(images / "parent")[page]
+                found[page] = parent[page]
             else:
                 found[page], pages = pages[:PAGE], pages[PAGE:]
     assert not pages
@@ -98,6 +113,28 @@ def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before
         else:
             assert sent == len(after)
             assert sizes == {}
+
+
+@given(memories, memories, memories)
+@example(FULL, {**FULL, 3: 2}, FULL)
+@example(FULL, {**FULL, 3: 2}, {**FULL, 3: 2, 64: 2})
+def test_any_dump_is_restored_exactly_from_two_copies(before, between, after):
+    """The second copy has the pages that had changed by then; the newer content counts."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        copy, newest = copied_again(dump_after_copy(folder, before, after), before, between)
+        sizes = copied_pages.remove_copied_pages(folder, copy, lambda: None)
+        sent = (folder / PAGES / "pages-1.img").stat().st_size // PAGE
+        named = {**image.file_sizes(folder), **sizes}
+        copied_pages.move_into_parent(folder, copy.directory)
+        assert image.file_sizes(folder) == named
+        assert restored(folder / PAGES) == {page: content(one) for page, one in after.items()}
+        changed = sum(newest.get(page) != number for page, number in after.items())
+        if before and (len(after) - changed) * 8 >= len(after):
+            assert sent == changed
+            assert sizes.keys() == {f"{one}/{file_name(PID)}" for one in (PARENT, GRANDPARENT)}
+        else:
+            assert sent == len(after)
 
 
 def test_the_format_is_that_of_criu():
@@ -158,13 +195,17 @@ def test_copies_that_the_dump_does_not_use_stay_out_of_the_image(tmp_path):
 
 # --- the copy ---------------------------------------------------------------------------------
 
-#: Maps 1 MiB of ones and 1 MiB that it never touches, and prints their address.
+#: Maps 1 MiB of ones and 1 MiB that it never touches, and prints their address. For each line of
+#: input it changes the fourth page.
 HOLDER = """
 import ctypes, mmap, sys
 area = mmap.mmap(-1, 1 << 21, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
 area[:1 << 20] = bytes([1]) * (1 << 20)
-print(ctypes.addressof(ctypes.c_char.from_buffer(area)), flush=True)
-sys.stdin.read()
+begin = ctypes.addressof(ctypes.c_char.from_buffer(area))
+print(begin, flush=True)
+for line in sys.stdin:
+    area[3 * mmap.PAGESIZE] += 1
+    print(begin, flush=True)
 """
 
 
@@ -194,6 +235,27 @@ def test_the_memory_of_a_running_process_is_copied(tmp_path, holder):
     assert not any(begin + offset in found for offset in range(1 << 20, 1 << 21, PAGE))
     assert copy.directory.stat().st_mode & 0o777 == 0o700
     assert file.stat().st_mode & 0o777 == 0o600
+
+
+def test_what_has_changed_since_is_copied_once_more(tmp_path, holder):
+    """The new pages are in a file of their own, and the first copy stays as it was."""
+    begin = int(holder.stdout.readline())
+    first = memory_copy.copy([holder.pid], tmp_path / "copy", lambda: None)
+    before = (first.directory / file_name(holder.pid)).read_bytes()
+    holder.stdin.write(b"\n")
+    holder.stdin.flush()
+    assert int(holder.stdout.readline()) == begin
+    copy = memory_copy.copy_changes(first, [holder.pid], lambda: None)
+    pages = [
+        one.begin + page * PAGE for one in copy.ranges[holder.pid] for page in range(one.pages)
+    ]
+    changed = [page for page, mark in zip(pages, copy.changed[holder.pid], strict=True) if mark]
+    data = (copy.directory / CHANGES / file_name(holder.pid)).read_bytes()
+    assert len(data) == len(changed) * PAGE
+    at = changed.index(begin + 3 * PAGE) * PAGE
+    assert data[at : at + PAGE] == b"\2" + b"\1" * (PAGE - 1)
+    assert begin + 4 * PAGE not in changed
+    assert (first.directory / file_name(holder.pid)).read_bytes() == before
 
 
 def test_a_copy_can_be_ended(tmp_path, holder):

@@ -9,20 +9,33 @@ from itertools import count
 
 import pytest
 
-from rosrm_criu.engine.memory_copy import file_name
+from rosrm_criu.engine.memory_copy import CHANGES, file_name
 from rosrm_criu.engine.paths import received_copy, sent_copy
 from rosrm_criu.executors import artifacts, precopy
 from rosrm_criu.executors.request import StepArguments
-from rosrm_criu.plans import COPY_MEMORY, EXPECT_COPY, FETCH_COPY, MEASURE_MEMORY
+from rosrm_criu.plans import (
+    COPY_CHANGES,
+    COPY_MEMORY,
+    EXPECT_COPY,
+    FETCH_CHANGES,
+    FETCH_COPY,
+    MEASURE_MEMORY,
+)
 from rosrm_criu.transfer import Sender, missing
 from tests.waiting import PATIENCE, wait_until
 
 pytestmark = pytest.mark.skipif(bool(missing()), reason=missing() or "-")
 
 _numbers = count(1)
-HOLDER = (
-    "import sys; held = bytearray(b'1') * int(sys.argv[1]); print(flush=True); sys.stdin.read()"
-)
+#: Holds so many bytes, and changes as many of them as each line of input says.
+HOLDER = """
+import sys
+held = bytearray(b"1") * int(sys.argv[1])
+print(flush=True)
+for line in sys.stdin:
+    held[: int(line)] = bytes(int(line))
+    print(flush=True)
+"""
 
 
 class Steps:
@@ -58,6 +71,12 @@ class Steps:
         if answer:  # the master keeps no empty result
             self.results[name] = answer
         return answer
+
+    def change(self, size: int) -> None:
+        """Let the process write so many bytes of its memory."""
+        self.process.stdin.write(b"%d\n" % size)
+        self.process.stdin.flush()
+        assert self.process.stdout.readline()
 
     def until_offered(self) -> None:
         self.call(MEASURE_MEMORY, precopy.measure_memory)
@@ -98,6 +117,44 @@ def test_a_copy_is_at_the_destination_before_the_dump(steps):
     assert steps.received == steps.results[COPY_MEMORY]["offer"]["fingerprint"]
     precopy.sweep(steps.folder)
     assert [path.name for path in steps.there.iterdir()] == [file_name(steps.process.pid)]
+
+
+def test_what_changes_during_the_copy_is_at_the_destination_too(steps):
+    """The destination then names the offer of the second copy."""
+    steps.until_offered()
+    steps.fetch()
+    steps.change(precopy.LEAST_CHANGES)
+    steps.call(COPY_CHANGES, precopy.copy_changes)
+    answer = steps.call(FETCH_CHANGES, precopy.fetch_changes)
+    assert answer["received"] > 0
+    assert steps.received == steps.results[COPY_CHANGES]["offer"]["fingerprint"]
+    [pages] = (steps.there / CHANGES).iterdir()
+    assert precopy.LEAST_CHANGES <= pages.stat().st_size < precopy.LEAST
+
+
+@pytest.mark.parametrize("size", [0, 2 * precopy.LEAST])
+def test_few_and_many_changes_are_left_to_the_dump(steps, size):
+    """The first copy stays in use."""
+    steps.until_offered()
+    steps.fetch()
+    if size:
+        steps.change(size)
+    assert "too few or too many" in steps.call(COPY_CHANGES, precopy.copy_changes)["skipped"]
+    assert steps.call(FETCH_CHANGES, precopy.fetch_changes) == {}
+    assert steps.received == steps.results[COPY_MEMORY]["offer"]["fingerprint"]
+    assert not (sent_copy(steps.folder, steps.number) / CHANGES).exists()
+
+
+def test_changes_that_do_not_arrive_are_no_failure(steps):
+    """The first copy stays in use."""
+    steps.until_offered()
+    steps.fetch()
+    steps.change(precopy.LEAST_CHANGES)
+    steps.call(COPY_CHANGES, precopy.copy_changes)
+    answer = steps.call(FETCH_CHANGES, precopy.fetch_changes, reserve=10**15)
+    assert "do not fit beside" in answer["skipped"]
+    assert steps.received == steps.results[COPY_MEMORY]["offer"]["fingerprint"]
+    assert not (steps.there / CHANGES).exists()
 
 
 def test_little_memory_is_not_copied(tmp_path):

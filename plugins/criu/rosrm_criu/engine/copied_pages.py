@@ -23,8 +23,15 @@ from numpy.typing import NDArray
 
 from rosrm.errors import CriuError
 from rosrm_criu.engine import protobuf
-from rosrm_criu.engine.image import PAGES, PARENT
-from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange, file_name
+from rosrm_criu.engine.image import GRANDPARENT, PAGES, PARENT
+from rosrm_criu.engine.memory_copy import (
+    CHANGES,
+    PAGE,
+    MemoryCopy,
+    PageRange,
+    file_name,
+    pages_in,
+)
 
 #: Flags of CRIU's pagemap_entry: PE_PARENT (the pages are in the parent image), PE_PRESENT (the
 #: pages are in the file of pages), PE_LAZY (they may be restored on their first use).
@@ -33,7 +40,6 @@ _IN_PARENT, _PRESENT, _LAZY = 1, 4, 2
 _AT_ONCE: Final = 16384
 #: A dump with fewer equal pages than one of so many stays whole, because it is sent sooner so.
 _LEAST_EQUAL: Final = 8
-_PAGE: Final = np.dtype((np.void, PAGE))
 _NEW: Final = ".new"
 #: Name of a file with copied pages.
 _COPY: Final = re.compile(r"pages-\d+\.img", re.ASCII)
@@ -130,15 +136,14 @@ def remove_copied_pages(
         ValueError, KeyError: the dump has a form that is unknown here.
         OSError: a file cannot be read or written. After any error the dump is as before.
     """
-    images, parent = directory / PAGES, directory / PARENT
-    parent.mkdir(mode=0o700)
+    images = directory / PAGES
     try:
         sizes: dict[str, int] = {}
         for pid, ranges in copy.ranges.items():
             if ranges and (images / f"pagemap-{pid}.img").exists():
-                sizes |= _prepare(images, parent, copy, pid, check)
+                sizes |= _prepare(directory, copy, pid, check)
     except BaseException:
-        shutil.rmtree(parent)
+        shutil.rmtree(directory / PARENT, ignore_errors=True)
         for path in images.glob(f"*{_NEW}"):
             path.unlink()
         raise
@@ -148,41 +153,51 @@ def remove_copied_pages(
 
 
 def _prepare(
-    images: Path, parent: Path, copy: MemoryCopy, pid: int, check: Callable[[], None]
+    directory: Path, copy: MemoryCopy, pid: int, check: Callable[[], None]
 ) -> dict[str, int]:
     """Write the new files of one process; return the bytes of the files of its copied pages."""
-    name, ranges = f"pagemap-{pid}.img", copy.ranges[pid]
+    images, name = directory / PAGES, f"pagemap-{pid}.img"
     pagemap = Pagemap.decoded((images / name).read_bytes())
     pages = f"pages-{pagemap.file}.img"
-    dumped, before = _pages(images / pages), _pages(copy.directory / file_name(pid))
-    same = same_pages([one.page_range for one in pagemap.entries], ranges, dumped, before, check)
+    dumped, ranges = pages_in(images / pages), [one.page_range for one in pagemap.entries]
+    same, layers = np.zeros(len(dumped), np.bool_), list(_layers(copy, pid))
+    for _, file, entries in reversed(layers):  # a newer copy of a page replaces the older one
+        copied = [one.page_range for one in entries if one.flags == _PRESENT]
+        mark_same_pages(same, ranges, copied, dumped, pages_in(file), check)
     if same.sum() * _LEAST_EQUAL < len(same):
         return {}
     entries = list(split_entries(pagemap.entries, same))
     _write(images / f"{name}{_NEW}", [Pagemap(pagemap.magic, pagemap.file, entries).encoded()])
     _write(images / f"{pages}{_NEW}", _changed(entries, dumped, check))
-    own = Pagemap(pagemap.magic, pid, [Entry(one, _PRESENT) for one in ranges])
-    _write(parent / name, [own.encoded()])
+    for folder, _, own in layers:
+        (directory / folder).mkdir(mode=0o700, exist_ok=True)
+        _write(directory / folder / name, [Pagemap(pagemap.magic, pid, own).encoded()])
     os.link(images / pages, copy.directory / f"dumped-{pages}")
-    return {f"{PARENT}/{file_name(pid)}": before.nbytes}
+    return {f"{folder}/{file.name}": file.stat().st_size for folder, file, _ in layers}
 
 
-def _pages(path: Path) -> NDArray[np.void]:
-    """Return the pages of a file; two of them are equal if all their bytes are."""
-    empty = path.stat().st_size == 0
-    return np.empty(0, _PAGE) if empty else np.asarray(np.memmap(path, _PAGE, "r"))
+def _layers(copy: MemoryCopy, pid: int) -> Iterator[tuple[str, Path, list[Entry]]]:
+    """Yield the copies of a process, newest first: folder in the image, pages, and entries."""
+    whole, folder = [Entry(one, _PRESENT) for one in copy.ranges[pid]], PARENT
+    if copy.changed:
+        pages = copy.directory / CHANGES / file_name(pid)
+        yield folder, pages, list(split_entries(whole, ~copy.changed[pid]))
+        folder = GRANDPARENT
+    yield folder, copy.directory / file_name(pid), whole
 
 
-def same_pages(
+def mark_same_pages(
+    same: NDArray[np.bool_],
     dumped: Iterable[PageRange],
     copied: Sequence[PageRange],
     pages: NDArray[np.void],
     copy: NDArray[np.void],
     check: Callable[[], None],
-) -> NDArray[np.bool_]:
-    """Return the mask of the dumped pages that are equal to the copied page of the same address.
+) -> None:
+    """Mark which dumped pages are equal to the copied page of their address, if there is one.
 
     Args:
+        same: marks of the dumped pages.
         dumped: ranges of the dump, in the order of its pages.
         copied: ranges of the copy, in the order of its pages and by ascending address.
         pages: of the dump.
@@ -192,7 +207,6 @@ def same_pages(
     Raises:
         ValueError: the number of pages is not that of the ranges.
     """
-    same = np.zeros(len(pages), np.bool_)
     begins = [one.begin for one in copied]
     rows = [0, *accumulate(one.pages for one in copied)]
     row = 0
@@ -211,7 +225,6 @@ def same_pages(
         row += one.pages
     if (row, rows[-1]) != (len(pages), len(copy)):
         raise ValueError("the files have another number of pages than their ranges")
-    return same
 
 
 def split_entries(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator[Entry]:
@@ -252,10 +265,11 @@ def move_into_parent(directory: Path, copies: Path) -> None:
 
     The copies of processes without pages in the parent stay: small ones, and those that have ended.
     """
-    parent = directory / PARENT
-    for pagemap in parent.glob("pagemap-*.img"):
-        name = pagemap.name.replace("pagemap", "pages")
-        (copies / name).rename(parent / name)
+    sources = [copies / CHANGES, copies] if (directory / GRANDPARENT).is_dir() else [copies]
+    for source, folder in zip(sources, (PARENT, GRANDPARENT), strict=False):
+        for pagemap in (directory / folder).glob("pagemap-*.img"):
+            name = pagemap.name.replace("pagemap", "pages")
+            (source / name).rename(directory / folder / name)
 
 
 def check_files(directory: Path) -> None:

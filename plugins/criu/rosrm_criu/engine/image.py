@@ -33,6 +33,8 @@ PAGES: Final = "criu"
 COPIES: Final = "files"
 #: Below CRIU's files of an image: pages that were sent before the dump.
 PARENT: Final = f"{PAGES}/parent"
+#: The parent of these, if pages were sent twice: those of the first time.
+GRANDPARENT: Final = f"{PARENT}/parent"
 #: Exists during a restore: like `PAGES`, with the paths of this host.
 HERE: Final = f"{PAGES}.here"
 DUMP_LOG: Final = "dump.log"

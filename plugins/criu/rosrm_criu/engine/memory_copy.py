@@ -10,15 +10,20 @@ import mmap
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from rosrm.supervisor.procfs import inner_pid
 
 PAGE: Final = mmap.PAGESIZE
+#: Two pages are equal if all their bytes are.
+_WHOLE: Final = np.dtype((np.void, PAGE))
+#: Folder below a copy with the pages that were copied once more.
+CHANGES: Final = "changes"
 #: Areas with less anonymous memory are not copied, because each one costs time in the dump.
 _LEAST: Final = 256 << 10
 #: Bytes per read of memory, and of address space whose pages are looked up at once.
@@ -56,10 +61,19 @@ class MemoryCopy:
         directory: contains the file `file_name(pid)` of each process, with its pages in order.
         ranges: the copied pages of each process, by ascending address. The keys are pids in the
             namespaces of the processes.
+        changed: which of these pages were copied once more, into the folder `CHANGES`, whose pages
+            replace the former ones; empty: none were.
     """
 
     directory: Path
     ranges: Mapping[int, Sequence[PageRange]]
+    changed: Mapping[int, NDArray[np.bool_]] = field(default_factory=dict)
+
+
+def pages_in(path: Path) -> NDArray[np.void]:
+    """Return the pages of a file; raise OSError."""
+    empty = path.stat().st_size == 0
+    return np.empty(0, _WHOLE) if empty else np.asarray(np.memmap(path, _WHOLE, "r"))
 
 
 def file_name(pid: int) -> str:
@@ -106,6 +120,56 @@ def _copy_one(pid: int, directory: Path, check: Callable[[], None]) -> list[Page
                 if size:
                     copied.append(PageRange(found.begin, size // PAGE))
     return copied
+
+
+def copy_changes(former: MemoryCopy, pids: Iterable[int], check: Callable[[], None]) -> MemoryCopy:
+    """Copy once more the pages of running processes that have changed since their copy.
+
+    Pages that are new since then are left to the dump.
+
+    Args:
+        former: the copy.
+        pids: of the processes; those without a copy are left out.
+        check: called again and again; may raise an error to end the copy.
+
+    Raises:
+        OSError: a process has ended, its memory may not be read, or the disk is full.
+    """
+    (former.directory / CHANGES).mkdir(mode=0o700)
+    known = {inner_pid(pid): pid for pid in pids}
+    changed = {
+        inner: _copy_changes_of(pid, inner, former, check)
+        for inner, pid in known.items()
+        if inner in former.ranges
+    }
+    return replace(former, ranges={pid: former.ranges[pid] for pid in changed}, changed=changed)
+
+
+def _copy_changes_of(
+    pid: int, inner: int, former: MemoryCopy, check: Callable[[], None]
+) -> NDArray[np.bool_]:
+    """Write the changed pages of one process; return the mask of them among those of the copy."""
+    before, row = pages_in(former.directory / file_name(inner)), 0
+    changed = np.zeros(len(before), np.bool_)
+    path = former.directory / CHANGES / file_name(inner)
+    path.touch(mode=0o600, exist_ok=False)
+    with (
+        path.open("wb", buffering=0) as file,
+        Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory,
+        Path(f"/proc/{pid}/pagemap").open("rb", buffering=0) as pagemap,
+    ):
+        for copied in former.ranges[inner]:
+            for found in _held(pagemap.fileno(), copied.begin, copied.end):
+                at = row + (found.begin - copied.begin) // PAGE
+                for piece in _pieces(memory.fileno(), found):
+                    check()
+                    pages = np.frombuffer(piece, _WHOLE)
+                    after = at + len(pages)
+                    changed[at:after] = pages != before[at:after]
+                    file.write(pages[changed[at:after]].data)
+                    at = after
+            row += copied.pages
+    return changed
 
 
 def _areas(pid: int) -> Iterator[tuple[int, int, int]]:

@@ -28,6 +28,8 @@ _GROUPS: Final = frozenset({2, 4, 6, 8, 14})
 _CAPABILITIES: Final = frozenset({10, 11})
 #: CRIU's files that would give a process other credentials than those of its threads' files.
 _OTHER_CREDENTIALS: Final = re.compile(rf"{image.PAGES}/(creds|userns)-\d+\.img")
+#: Folders of an image.
+_FOLDERS: Final = (image.PAGES, image.PARENT, image.GRANDPARENT, image.COPIES)
 #: Bits of an id, or of one number of a set of capabilities; CRIU ignores higher ones.
 _WORD: Final = 0xFFFFFFFF
 
@@ -72,7 +74,7 @@ def _check_names(directory: Path, manifest: Manifest) -> None:
     expected = {*manifest.sizes, image.MANIFEST, image.DUMP_LOG}
     for path in directory.rglob("*"):
         name = path.relative_to(directory).as_posix()
-        if name not in expected and name not in (image.PAGES, image.PARENT, image.COPIES):
+        if name not in expected and name not in _FOLDERS:
             raise CriuError(f"the image holds {name!r}, which its manifest does not name: refused")
 
 

@@ -11,7 +11,7 @@ import functools
 import threading
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -19,16 +19,26 @@ from typing import Final
 from rosrm.errors import CriuError
 from rosrm_criu.engine import copied_pages, image, memory_copy, process_tree
 from rosrm_criu.engine.image import Manifest
-from rosrm_criu.engine.memory_copy import MemoryCopy
+from rosrm_criu.engine.memory_copy import CHANGES, MemoryCopy, file_name
 from rosrm_criu.engine.paths import numbers, received_copy, sent_copy
 from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors.attempts import Answer
 from rosrm_criu.executors.request import StepArguments
-from rosrm_criu.plans import COPY_MEMORY, EXPECT_COPY, FETCH_COPY, INTRODUCE, MEASURE_MEMORY
-from rosrm_criu.transfer import Offer, Sender
+from rosrm_criu.plans import (
+    COPY_CHANGES,
+    COPY_MEMORY,
+    EXPECT_COPY,
+    FETCH_CHANGES,
+    FETCH_COPY,
+    INTRODUCE,
+    MEASURE_MEMORY,
+)
+from rosrm_criu.transfer import Fetcher, Offer, Sender
 
 #: Minimum bytes of memory for a copy. Less memory is dumped, sent and restored within a second.
 LEAST: Final = 64 << 20
+#: Minimum bytes of changes for a second copy. Fewer are sent with the dump in a tenth of a second.
+LEAST_CHANGES: Final = 8 << 20
 #: First part of the names of copies that are being removed.
 _UNUSED: Final = ".unused-copy-"
 
@@ -41,11 +51,13 @@ class _Sent:
         copy: its files and pages.
         offer: fingerprint of its offer.
         sender: its sending end.
+        former: the first copy, if this is the second one.
     """
 
     copy: MemoryCopy
     offer: str
     sender: Sender
+    former: _Sent | None = None
 
 
 _changing: Final = threading.Lock()
@@ -106,17 +118,58 @@ def copy_memory(asked: StepArguments) -> Answer:
         return {}
     remove_sent_copy(asked.state, asked.source)
     directory = sent_copy(asked.state, asked.source)
+    return _offer(
+        asked, str(to), directory, lambda check: memory_copy.copy(_pids(asked), directory, check)
+    )
+
+
+@_optional(COPY_CHANGES)
+def copy_changes(asked: StepArguments) -> Answer:
+    """Copy once more what has changed during the copy and its transfer, and offer these pages."""
+    to = asked.answer_of(FETCH_COPY).get("certificate")
+    with _changing:
+        former = _sent.get(asked.source)
+    if not to or former is None:
+        return {}
+    copied, directory = former.copy, former.copy.directory / CHANGES
+
+    def copy(check: Callable[[], None]) -> MemoryCopy:
+        found = memory_copy.copy_changes(copied, _pids(asked), check)
+        size, whole = (
+            sum((one / file_name(pid)).stat().st_size for pid in found.ranges)
+            for one in (directory, copied.directory)
+        )
+        if not LEAST_CHANGES <= size <= whole / 2:
+            raise CriuError(f"{size} of {whole} bytes have changed: too few or too many")
+        image.check_room(copied.directory, process_tree.memory_of(_pids(asked)))
+        return found
+
+    return _offer(asked, str(to), directory, copy, former)
+
+
+def _offer(
+    asked: StepArguments, to: str, directory: Path,
+    copy: Callable[[Callable[[], None]], MemoryCopy], former: _Sent | None = None,
+) -> Answer:  # fmt: skip
+    """Make a copy of memory, and offer it.
+
+    Args:
+        asked: arguments of the step.
+        to: certificate of the destination.
+        directory: of the copied pages to send; a new one.
+        copy: makes the copy; it calls its argument again and again.
+        former: the first copy, if this is the second one.
+    """
     sender = Sender()
     try:
         # Half of the timeout, because the sender must start after the copy and before the step
         # times out.
-        check = _check_until(asked.attempt, asked.timeout / 2)
-        copy = memory_copy.copy(_pids(asked), directory, check)
+        made = copy(_check_until(asked.attempt, asked.timeout / 2))
         offer = sender.offer(
-            directory, seconds=float(asked.arguments["offer"]), to=str(to),
+            directory, seconds=float(asked.arguments["offer"]), to=to,
             max_rate=float(asked.arguments["max_rate"]),
         )  # fmt: skip
-        sent = _Sent(copy, offer.fingerprint, sender)
+        sent = _Sent(made, offer.fingerprint, sender, former)
         with _changing:
             attempts.check_wanted(asked.attempt)
             _sent[asked.source] = sent
@@ -124,6 +177,8 @@ def copy_memory(asked: StepArguments) -> Answer:
         sender.close()
         artifacts.discard(directory)
         raise
+    if former is not None:
+        former.sender.close()
     artifacts.call_later(
         float(asked.arguments["keep"]), remove_sent_copy, asked.state, asked.source, sent
     )
@@ -146,7 +201,9 @@ def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) 
     """
     with _changing:
         sent = _sent.get(asked.source)
-    if sent is None or sent.offer != asked.results[INTRODUCE].get("copy"):
+    while sent is not None and sent.offer != asked.results[INTRODUCE].get("copy"):
+        sent = sent.former
+    if sent is None:
         return False
     try:
         check = _check_until(asked.attempt, float(asked.arguments["seconds"]["compare"]))
@@ -185,7 +242,7 @@ def remove_sent_copy(state: Path, number: int, only: _Sent | None = None) -> Non
     """
     with _changing:
         sent = _sent.get(number)
-        if only not in (None, sent):
+        if only is not None and only is not sent:
             return
         _sent.pop(number, None)
         renamed = _renamed(sent_copy(state, number))
@@ -216,17 +273,41 @@ def fetch_copy(asked: StepArguments) -> Answer:
     copied = asked.answer_of(COPY_MEMORY)
     if "offer" not in copied:
         return {}
-    offer = Offer.from_json(copied["offer"])
-    directory = received_copy(asked.state, asked.destination)
     remove_received_copy(asked.state, asked.destination)
+    with _receiving_end(asked) as fetcher:
+        # Before the fetch, because the node writes more while the next end starts.
+        again = artifacts.open_fetcher(asked.destination, float(asked.arguments["keep"]))
+        directory = received_copy(asked.state, asked.destination)
+        return {**_fetch(asked, fetcher, copied, directory), "certificate": again}
+
+
+@_optional(FETCH_CHANGES)
+def fetch_changes(asked: StepArguments) -> Answer:
+    """Fetch the pages that were copied once more."""
+    copied = asked.answer_of(COPY_CHANGES)
+    if "offer" not in copied:
+        return {}
+    with _receiving_end(asked) as fetcher:
+        directory = received_copy(asked.state, asked.destination) / CHANGES
+        return _fetch(asked, fetcher, copied, directory)
+
+
+@contextlib.contextmanager
+def _receiving_end(asked: StepArguments) -> Iterator[Fetcher]:
     fetcher = artifacts.take_fetcher(asked.destination)
     if fetcher is None:
         raise CriuError("the slave was started again since the copy was offered")
     try:
-        reserve = int(asked.arguments["reserve"]) + offer.size
-        fetched = fetcher.fetch(offer, directory, timeout=asked.timeout, reserve=reserve)
+        yield fetcher
     finally:
         artifacts.close_soon(fetcher)
+
+
+def _fetch(asked: StepArguments, fetcher: Fetcher, copied: Answer, directory: Path) -> Answer:
+    """Fetch what the source has copied into a new directory, if the whole dump fits beside it."""
+    offer = Offer.from_json(copied["offer"])
+    reserve = int(asked.arguments["reserve"]) + int(asked.answer_of(COPY_MEMORY)["offer"]["size"])
+    fetched = fetcher.fetch(offer, directory, timeout=asked.timeout, reserve=reserve)
     try:
         copied_pages.check_files(directory)
         with _changing:

@@ -58,7 +58,8 @@ class StepArguments:
 
     def answer_of(self, step: str) -> Mapping[str, Any]:
         """Return the result of an earlier step; the master leaves out empty results."""
-        return self.results.get(step, {})
+        answer: Mapping[str, Any] = self.results.get(step, {})
+        return answer
 
     def pid(self, number: int) -> int:
         """Return the pid of the leader of an instance that lives here; 0: there is none."""
