@@ -25,8 +25,8 @@ from tests.ros.portable_kit import NAME, Listener, ask, counter, nothing_left, t
 pytestmark = pytest.mark.timeout(300)
 
 _OTHER = {"left": "right", "right": "left"}
-#: Bytes a second, so that a transfer takes a while.
-_SLOWLY = 4_000_000
+#: Bytes a second, so that a transfer takes a while; for a node with much memory.
+_SLOWLY, _LESS_SLOWLY = 4_000_000, 40_000_000
 
 
 class Scene:
@@ -34,14 +34,19 @@ class Scene:
 
     Args:
         make: makes a cluster.
+        arguments: of the counter.
+        max_rate: bytes a second that a transfer may send.
         lease: seconds of silence after which a host is lost.
         fields: of the counter's spec.
     """
 
-    def __init__(self, make, lease: float = LivenessSettings().lease, **fields) -> None:
+    def __init__(
+        self, make, *arguments: str, max_rate: int = _SLOWLY,
+        lease: float = LivenessSettings().lease, **fields,
+    ) -> None:  # fmt: skip
         self.cluster = two_hosts(make, liveness=LivenessSettings(lease=lease))
         self.listener = Listener(self.cluster.domain)
-        self.cluster.submit(counter(options={"max_rate": _SLOWLY}, **fields))
+        self.cluster.submit(counter(*arguments, options={"max_rate": max_rate}, **fields))
         self._source = self._number = 0
         self.source = ""
 
@@ -69,7 +74,7 @@ class Scene:
         )
         if moment == "checkpoint":
             return here.glob("out-*")
-        if moment == "fetch":
+        if moment in ("copy", "fetch"):  # only a node with much memory is copied
             return there.glob(".rosrm-fetch-*/*")
         if moment == "restore":
             return there.glob("in-*/manifest.json")
@@ -146,6 +151,14 @@ def scene(make_shared):
 
 
 @pytest.fixture(scope="module")
+def large(make_shared):
+    """Yield a scene whose counter has enough memory for a copy before its dump."""
+    one = Scene(make_shared, "--mb", "80", "--period", "0.02", max_rate=_LESS_SLOWLY)
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope="module")
 def restless(make_shared):
     """Yield a scene with a short lease and `host_loss: elsewhere`."""
     one = Scene(make_shared, lease=4.0, host_loss=HostLossPolicy("elsewhere"))
@@ -162,6 +175,16 @@ def test_the_master_or_a_slave_is_killed(criu, scene, victim, moment):
     scene.end()
     assert min(scene.listener.steps()) > 0
     assert len(scene.listener.checksums) == 1
+
+
+@pytest.mark.parametrize("victim", ["source's slave", "destination's slave"])
+def test_a_slave_is_killed_during_the_copy_of_the_memory(criu, large, victim):
+    """The node migrates with its whole memory, or stays, and no part of the copy is left."""
+    large.move("copy")
+    large.kill(victim)
+    large.end()
+    assert min(large.listener.steps()) > 0
+    assert len(large.listener.checksums) == 1
 
 
 @pytest.mark.parametrize("moment", ["restore", "join"])
