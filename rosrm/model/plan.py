@@ -34,6 +34,8 @@ class Move:
             of the process; an object of the offer's `own_options` or `options`.
         new_spec: spec of the destination, if the process is replaced by another version of it;
             None: the destination has the spec of the source.
+        lacking: executors of the strategy's offer that one of the two hosts does not have, because
+            it has another version of the plugin.
     """
 
     spec: ProcessSpec
@@ -46,6 +48,7 @@ class Move:
     source_node: str
     options: Any = None
     new_spec: ProcessSpec | None = None
+    lacking: frozenset[str] = frozenset()
 
     @property
     def destination_spec(self) -> ProcessSpec:

@@ -91,6 +91,18 @@ class TestCriu(MigrationContract):
         assert at["criu_introduce"] < at["criu_checkpoint"] < at["criu_fetch"]
         assert plan.overlap == 0.0
 
+    def test_a_host_of_an_older_version_needs_no_executor_of_the_copy(self):
+        """The plan then has all other steps; a copy is all steps or none."""
+        move, strategy = self.moves()[0], self.offer.create(self.offer.options())
+        whole, less = (
+            [one.executor for one in strategy.propose(given).steps if isinstance(one, Execute)]
+            for given in (move, replace(move, lacking=frozenset({"criu_copy_changes"})))
+        )
+        copy = [name for name in whole if name not in less]
+        assert len(copy) == 6
+        assert [name for name in whole if name in less] == less
+        assert "criu_remove_copy" not in str(strategy.propose(replace(move, lacking={*copy})))
+
 
 def test_each_shipped_strategy_is_here():
     """Each strategy in the plugin must have a contract class in this file."""

@@ -43,6 +43,13 @@ FETCH: Final = "criu_fetch"
 AWAIT_RESTORED: Final = "criu_await_restored"
 JOIN: Final = "criu_join"
 END: Final = "criu_end"
+#: Those of the copy, without which a host of an older version can take part in a move.
+_OF_THE_COPY: Final = frozenset(
+    {
+        MEASURE_MEMORY, EXPECT_COPY, COPY_MEMORY, FETCH_COPY, COPY_CHANGES, FETCH_CHANGES,
+        REMOVE_COPY,
+    }
+)  # fmt: skip
 #: Executors of a checkpoint and its restore; see `executors/checkpoint.py`.
 KEEP: Final = "criu_keep"
 RUN_ON: Final = "criu_run_on"
@@ -115,9 +122,11 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
         "leave": options.leave_timeout, "dump": options.dump_timeout, "compare": start,
         "offer": options.transfer_timeout + start,
     }  # fmt: skip
+    keep = until_dumped + options.transfer_timeout + 4 * start
+    copy = () if move.lacking & _OF_THE_COPY else _precopy(move, options, keep)
     return Plan(
         (
-            *_precopy(move, options, keep=until_dumped + options.transfer_timeout + 4 * start),
+            *copy,
             suspend(move, start),
             execute(
                 move, there, INTRODUCE, start, keep=until_dumped + 2 * start,

@@ -539,6 +539,18 @@ def test_a_plan_is_refused_before_its_first_step_where_a_host_lacks_an_executor(
     assert cluster.state.hosts.processes.tolist() == [1, 0]
 
 
+def test_a_plan_can_do_without_an_executor_that_a_host_lacks() -> None:
+    """The strategy knows before it plans what an older version on one of the hosts lacks."""
+
+    def propose(move: Move) -> Plan:
+        plan = waits_first(move)
+        return replace(plan, steps=plan.steps[1:]) if "sleepy.wait" in move.lacking else plan
+
+    declared = Declared(executors={"strange": frozenset({"sleepy.wait"})})
+    cluster = moving_by(propose, here={"sleepy.wait": lambda _: {}}, declared=declared)
+    assert cluster.migrate("p").host == "b"
+
+
 def test_a_move_goes_to_the_next_host_where_the_best_lacks_an_executor() -> None:
     """A host that was requested by name is not replaced by another one."""
     cluster = sleepy("sleepy.wait")

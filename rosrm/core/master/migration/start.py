@@ -222,12 +222,16 @@ def _lacks(state: MasterState, migration: Migration, executor: str, hosts: list[
 def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> Plan | Rejected:
     """Return the plan of a named strategy, or why there is none.
 
-    The options of the strategy are added to `move`. The reason names a strategy that raises.
+    The options of the strategy, and its executors that a host lacks, are added to `move`. The
+    reason names a strategy that raises.
     """
 
     def ask() -> Plan | Rejected:
         try:
-            given = replace(move, options=state.declared.options_of(name, move.spec))
+            given = replace(
+                move, options=state.declared.options_of(name, move.spec),
+                lacking=_lacking_executors(state, name, move),
+            )  # fmt: skip
             plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
             return _no_plan(name, describe_fault(reason))
@@ -241,6 +245,13 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
         return state.plugins.ask("migration", name, _HOOKS[aim], ask, state.strategies[name])
     except PluginError as fault:
         return _no_plan(name, str(fault))
+
+
+def _lacking_executors(state: MasterState, strategy: str, move: Move) -> frozenset[str]:
+    """Return the executors of a strategy that the source or the destination does not have."""
+    own = state.declared.executors.get(strategy, frozenset())
+    hosts = [state.hosts.by_name[name] for name in (move.source_host, move.destination_host)]
+    return frozenset(one for one in own if any(_has_not(host, one) for host in hosts))
 
 
 def _no_plan(strategy: str, reason: str) -> Rejected:
