@@ -180,6 +180,8 @@ def _note_restarts(
     """Note the restarts of a process; the arguments are those of `_is_another_run`."""
     if _is_another_run(process, status, before, pid):
         dependants.note_restart(state, process)
+        if status.state is not InstanceState.BACKOFF:  # in back-off its standby takes over
+            failover.note_restart(state, process)
     if process.restarts != status.restarts:
         process.phase_before_loss = None  # restarted while its host was silent
         note_run(process, status)  # of the run before the restart

@@ -21,8 +21,10 @@ from rosrm.model.values import (
     InstanceStatus,
     MigrationPolicy,
     ProcessSpec,
+    Readiness,
     RestartPolicy,
 )
+from rosrm_migration.handoff import WATCH, Handoff, HandoffOptions
 from tests.unit.core.cluster import Cluster, HandOver, Machine, process
 
 ON_FAILURE = RestartPolicy("on-failure", delay=0.5)
@@ -104,6 +106,21 @@ def test_a_handoff_without_faults_publishes_each_phase_once() -> None:
     has_moved(cluster)
     assert published(cluster) == ["SHADOW", "SWITCH", "DONE"]
     assert cluster["p"].migrations == 1
+
+
+def test_a_shadow_without_a_reply_is_repeated_until_the_next_step_is_done() -> None:
+    """A node of the paper may join when newer messages about other handoffs replaced the first."""
+    state = {"protocol": "paper", "state": "/state", "type": "std_msgs/msg/Int64"}
+    policy = MigrationPolicy("handoff", options=state)
+    spec = process("p", ros=True, readiness=Readiness("running"), migration=policy)
+    cluster = two_hosts(spec=spec, strategies={"handoff": Handoff(HandoffOptions())})
+    cluster.machines["b"].executors[WATCH] = lambda _: {}
+    begin(cluster, HandoffPhase.SHADOW)
+    cluster.cut("b", seconds=5.0)  # the watch does not begin
+    assert published(cluster) == ["SHADOW"] * 3
+    cluster.reconnect("b", seconds=5.0)
+    assert published(cluster) == ["SHADOW"] * 3 + ["DONE"]
+    assert cluster.where("p") == ["b"]
 
 
 def test_a_report_names_its_phase_only() -> None:

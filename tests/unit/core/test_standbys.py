@@ -274,6 +274,29 @@ def test_a_restart_by_request_causes_no_take_over() -> None:
     assert cluster.active() == ["a"]
 
 
+def test_the_standby_of_a_restarted_primary_is_replaced() -> None:
+    """The new run may miss the SHADOW: newer messages about other handoffs have replaced it."""
+    cluster = with_standby()
+    cluster.air.latched.clear()
+    cluster.restart("p")
+    cluster.wait(8.0)
+    assert cluster.recorded("standby_lost") == [
+        "p has no standby: p#1 was restarted; the master starts another one in 2 s"
+    ]
+    assert len(cluster.recorded("standby_ready")) == 2
+    assert (cluster.where("p"), cluster.active(), cluster["p"].owner) == (["a", "b"], ["a"], 1)
+
+
+def test_a_standby_with_the_state_of_a_former_run_does_not_take_over() -> None:
+    """The new run ends before the master has replaced the standby."""
+    cluster = with_standby()
+    cluster.restart("p")
+    cluster.leave("a")
+    cluster.wait(5.0)
+    assert not cluster.recorded("failed_over")
+    assert cluster.active() == ["b"]
+
+
 def test_a_failed_move_keeps_the_standby() -> None:
     """The same standby stays ready."""
     cluster = moving_to_an_unready_host()

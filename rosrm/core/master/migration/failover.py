@@ -47,7 +47,7 @@ def _has_state(state: MasterState, process: Process) -> bool:
 def _reports_of_standby(state: MasterState, process: Process) -> HandoffReports | None:
     """Return the reports of the standby that follows the owner of a process; None: none does."""
     standby = state.standbys.get(process.name)
-    if standby is None or standby.source.number != process.owner:
+    if standby is None or standby.source.number != process.owner or standby.source_restarted:
         return None
     if process.wanted is DesiredState.CANCEL:
         return None
@@ -56,6 +56,16 @@ def _reports_of_standby(state: MasterState, process: Process) -> HandoffReports 
     if reports is None or instance is None or instance.stopping:
         return None
     return None if reports.phases.keys() & _NOT_FOLLOWING else reports
+
+
+def note_restart(state: MasterState, process: Process) -> None:
+    """Note that a READY standby has only the state of the former run of its primary.
+
+    The master sends no more SHADOW to a READY standby. So the new run may never learn of it, and
+    the standby would wait with its old state.
+    """
+    if is_ready(state, process) and not state.instances[process.owner].stopping:
+        state.standbys[process.name].source_restarted = True
 
 
 def take_over(state: MasterState, process: Process, end: End, now: float) -> bool:

@@ -89,6 +89,20 @@ def republish(state: MasterState, migration: Migration, step: Configure, now: fl
         publish(state, migration, step.phase)
 
 
+def republish_unawaited(state: MasterState, migration: Migration, now: float) -> None:
+    """Repeat a SHADOW without a reply during the step after it.
+
+    The destination may join only when newer messages about other handoffs have replaced the first.
+    """
+    before = migration.plan.steps[migration.index - 1] if migration.index else None
+    if migration.undo is not None or not isinstance(before, Configure) or before.awaited:
+        return
+    late = now - migration.order_at >= state.settings.order_retry
+    if before.phase is HandoffPhase.SHADOW and late:
+        migration.order_at = now
+        publish(state, migration, before.phase)
+
+
 def _needs_take_over(state: MasterState, migration: Migration, step: Configure) -> bool:
     """Return True if the source ended while the master awaited its silence.
 

@@ -9,6 +9,7 @@ process                 action on its standby
 runs without standby    a standby is started as a shadow, on another host that has room
 standby starts          `state_config` names primary and standby, until the standby is READY
 standby has failed      the standby is stopped; another one starts after a delay that doubles
+is restarted            a READY standby is replaced, because its state is of the former run
 is in back-off          the primary is stopped for good, and the standby takes over
 migrates                the standby stays until the commit, because the migration may fail
 has ended               the standby is stopped
@@ -151,6 +152,8 @@ def _review(state: MasterState, migration: Migration, now: float) -> None:
         _end(state, process, now)
     elif instance.host.draining:
         _lost(state, process, migration, f"{instance.host.name} is being drained", now)
+    elif migration.source_restarted:
+        _lost(state, process, migration, f"{migration.source} was restarted", now)
     elif (gave_up := _why_given_up(migration)) is not None:
         _lost(state, process, migration, gave_up, now)
     else:

@@ -219,13 +219,13 @@ def _in_the_way(state: MasterState, migration: Migration, step: Start, now: floa
 def _give_order_again(state: MasterState, migration: Migration, step: Step, now: float) -> None:
     """Repeat the order for a start, a stop or a restart policy, because orders may be lost.
 
-    These orders are idempotent. A start that another instance delays is ordered as soon as the
-    other instance has ended.
+    These orders, and the phases of a handoff, are idempotent. A start that another instance delays
+    is ordered as soon as the other instance has ended.
     """
     if isinstance(step, Configure):
         handoff.republish(state, migration, step, now)
     elif isinstance(step, Execute | AwaitReady | AwaitReleased | Commit):
-        return
+        handoff.republish_unawaited(state, migration, now)
     elif _has_waited(migration, step) or now - migration.order_at >= state.settings.order_retry:
         _give_order(state, migration, step, now)
 

@@ -80,6 +80,8 @@ class Migration:
             end of the undo, because the source may be started again.
         silent_at, active_at: begin and end of the blackout; None: it has not begun, or ended.
         is_timed: this master has seen all of the migration.
+        source_restarted: the source was restarted after a standby was READY, so that the standby
+            has the state of the former run.
         aim: purpose of the plan. Source and destination of a checkpoint or restore are on one host.
     """
 
@@ -119,6 +121,7 @@ class Migration:
     silent_at: float | None = None
     active_at: float | None = None
     is_timed: bool = True
+    source_restarted: bool = False
     plain_plan: Plain = field(init=False)
 
     def __post_init__(self) -> None:
