@@ -15,7 +15,8 @@ master's runtime, without the transport and the journal:
   commands, with the queue, the record and the intent of each. `assignments_per_s` is for equal
   processes, `mixed_assignments_per_s` for ten different demands by turns (such as the pieces of a
   map), where each assignment makes the scores of the other demands stale. `rate_of_floor`:
-  `assignments_per_s` as a share of what the floor alone would allow.
+  `assignments_per_s` as a share of what the floor alone would allow. Garbage is collected at the
+  thresholds of a master.
 - `constrained`: 1,000 processes submitted at once to 1,000 hosts. `plain`: ten different demands by
   turns; `applications`: the same demands with labels and neighbours, in applications of ten
   processes that belong together; `spread`: the same demands, in groups of 150 processes that keep
@@ -56,6 +57,7 @@ from rosrm.model.values import (
     ProcessSpec,
     ResourceDescription,
 )
+from rosrm.runtime.bootstrap import end_start
 from rosrm_scoring.network import Network, NetworkOptions
 from rosrm_scoring.weighted import DEFAULT_WEIGHTS, Weighted, WeightedOptions
 
@@ -203,7 +205,9 @@ def rate(hosts: int, runs: int, spec_of: SpecOf, count: int = _AT_ONCE) -> float
 def rate_once(hosts: int, spec_of: SpecOf, count: int, **bench_options: bool) -> float:
     bench = Bench(hosts, **bench_options)
     bench.submit([ProcessSpec("first", needs={"memory": 2.0**26})])
-    gc.collect()
+    gc.unfreeze()
+    gc.collect()  # the state of the former run
+    end_start()  # the thresholds of a master
     took, assigned = bench.submit([spec_of(number) for number in range(count)])
     assert assigned == count
     return assigned / took
