@@ -158,7 +158,7 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
 def _precopy(move: Move, options: CriuOptions, keep: float) -> tuple[Execute, ...]:
     """Return the steps that copy the memory of the running node to the destination.
 
-    The first copy takes long; what the node has written meanwhile is copied once more. All steps
+    The first copy takes long; what the node has written during it is copied once more. All steps
     succeed without a copy too: then the whole dump is sent.
 
     Args:

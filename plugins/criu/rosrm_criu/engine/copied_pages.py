@@ -29,6 +29,7 @@ from rosrm_criu.engine.memory_copy import (
     PAGE,
     MemoryCopy,
     PageRange,
+    equal_pages,
     file_name,
     pages_in,
 )
@@ -190,8 +191,8 @@ def mark_same_pages(
     same: NDArray[np.bool_],
     dumped: Iterable[PageRange],
     copied: Sequence[PageRange],
-    pages: NDArray[np.void],
-    copy: NDArray[np.void],
+    pages: NDArray[np.uint64],
+    copy: NDArray[np.uint64],
     check: Callable[[], None],
 ) -> None:
     """Mark which dumped pages are equal to the copied page of their address, if there is one.
@@ -200,8 +201,8 @@ def mark_same_pages(
         same: marks of the dumped pages.
         dumped: ranges of the dump, in the order of its pages.
         copied: ranges of the copy, in the order of its pages and by ascending address.
-        pages: of the dump.
-        copy: the copied pages.
+        pages: of the dump, one in each row.
+        copy: the copied pages, one in each row.
         check: called again and again; may raise an error.
 
     Raises:
@@ -220,7 +221,7 @@ def mark_same_pages(
                 check()
                 after = min(here + _AT_ONCE, end)
                 part = copy[there + here - begin : there + after - begin]
-                same[here:after] = pages[here:after] == part
+                same[here:after] = equal_pages(pages[here:after], part)
             at += 1
         row += one.pages
     if (row, rows[-1]) != (len(pages), len(copy)):
@@ -241,7 +242,7 @@ def split_entries(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator
 
 
 def _changed(
-    entries: Iterable[Entry], pages: NDArray[np.void], check: Callable[[], None]
+    entries: Iterable[Entry], pages: NDArray[np.uint64], check: Callable[[], None]
 ) -> Iterator[memoryview]:
     """Yield the pages that are not in the parent."""
     row = 0

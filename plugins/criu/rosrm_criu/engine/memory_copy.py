@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from rosrm.supervisor.procfs import inner_pid
 
 PAGE: Final = mmap.PAGESIZE
-#: Two pages are equal if all their bytes are.
-_WHOLE: Final = np.dtype((np.void, PAGE))
+#: Pages that are compared at once, so that the results stay in the processor's cache.
+_AT_ONCE: Final = 64
 #: Folder below a copy with the pages that were copied once more.
 CHANGES: Final = "changes"
 #: Areas with less anonymous memory are not copied, because each one costs time in the dump.
@@ -70,10 +70,20 @@ class MemoryCopy:
     changed: Mapping[int, NDArray[np.bool_]] = field(default_factory=dict)
 
 
-def pages_in(path: Path) -> NDArray[np.void]:
-    """Return the pages of a file; raise OSError."""
-    empty = path.stat().st_size == 0
-    return np.empty(0, _WHOLE) if empty else np.asarray(np.memmap(path, _WHOLE, "r"))
+def pages_in(path: Path) -> NDArray[np.uint64]:
+    """Return the pages of a file as a matrix, one page in each row; raise OSError."""
+    size = path.stat().st_size
+    flat = np.asarray(np.memmap(path, np.uint64, "r")) if size else np.empty(0, np.uint64)
+    return flat.reshape(-1, PAGE // 8)
+
+
+def equal_pages(some: NDArray[np.uint64], others: NDArray[np.uint64]) -> NDArray[np.bool_]:
+    """Return the mask of the pages that are equal to the other page in the same row."""
+    equal = np.empty(len(some), np.bool_)
+    for row in range(0, len(some), _AT_ONCE):
+        part = slice(row, row + _AT_ONCE)
+        equal[part] = (some[part] == others[part]).all(axis=1)
+    return equal
 
 
 def file_name(pid: int) -> str:
@@ -163,9 +173,9 @@ def _copy_changes_of(
                 at = row + (found.begin - copied.begin) // PAGE
                 for piece in _pieces(memory.fileno(), found):
                     check()
-                    pages = np.frombuffer(piece, _WHOLE)
+                    pages = np.frombuffer(piece, np.uint64).reshape(-1, PAGE // 8)
                     after = at + len(pages)
-                    changed[at:after] = pages != before[at:after]
+                    changed[at:after] = ~equal_pages(pages, before[at:after])
                     file.write(pages[changed[at:after]].data)
                     at = after
             row += copied.pages
