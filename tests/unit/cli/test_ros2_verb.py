@@ -69,8 +69,9 @@ def test_ros2_can_call_the_verb_without_a_base_class():
 
 
 @pytest.fixture
-def completer():
+def completer(monkeypatch):
     """Return the function by which argcomplete completes the words after `ros2 rosrm`."""
+    monkeypatch.setattr("rosrm.cli.ros2_verb._PATIENCE", 60.0)  # a busy machine needs some seconds
     parser = argparse.ArgumentParser()
     RosrmVerb().add_arguments(parser, "ros2")
     (action,) = (one for one in parser._actions if one.dest == "words")
