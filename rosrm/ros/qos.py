@@ -40,8 +40,8 @@ STATE_CONFIG: Final = latched(depth=200)
 #: reader, and with each message a heartbeat to every node. With a depth of 200 these were 600
 #: packets. They overflowed the socket of a busy source, which then received no input until the
 #: next heartbeat of its publisher (3 s). A node may miss older messages without harm: the master
-#: repeats a phase until its reply, repeats a SHADOW without a reply until the next step is done,
-#: and replaces the READY standby of a primary that was restarted.
+#: repeats a phase until its reply, repeats a SHADOW without a reply while the next step waits for
+#: an executor or for a report, and replaces the READY standby of a primary that was restarted.
 STATE_CONFIG_OUT: Final = latched(depth=20)
 #: One handoff: a restarted master receives the reports that it has missed.
 HANDOFF: Final = latched(depth=20)

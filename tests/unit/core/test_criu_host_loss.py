@@ -12,7 +12,15 @@ import pytest
 
 from rosrm.model.plan import Commit, Execute, Move, Plan, Start, Stop
 from rosrm.model.values import HostLossPolicy, MigrationPolicy
-from rosrm_criu.plans import AWAIT_RESTORED, END, FETCH, GO_ON, JOIN
+from rosrm_criu.plans import (
+    AWAIT_RESTORED,
+    COPY_MEMORY,
+    END,
+    FETCH,
+    GO_ON,
+    JOIN,
+    REMOVE_COPY,
+)
 from tests.unit.core.cluster import Cluster, Machine, node, process
 from tests.unit.core.portable import Portable, by_criu
 
@@ -267,6 +275,21 @@ def test_a_frozen_source_is_not_readopted(restarted: bool) -> None:
     nothing_else(cluster)
 
 
+def test_a_source_that_runs_during_the_copy_is_readopted() -> None:
+    """Its host is only cut off, and there is no room elsewhere: the node keeps its memory."""
+    cluster = story("elsewhere", "b")
+    host(cluster, "a").befalls[COPY_MEMORY] = lambda: cluster.set_host("b", "cordon")
+    host(cluster, "a").mute.add(COPY_MEMORY)
+    cluster.migrate("p", "b")
+    wait(cluster, 0.5)
+    lose(cluster, "a")
+    wait(cluster, LEASE + 3.0)
+    assert (cluster.phase("p"), cluster.queue()) == ("queued", ["p"])
+    back(cluster, "a")
+    runs_alone(cluster, "a")
+    assert cluster["p"].owner == 1
+
+
 # --- graceful stop of a slave -----------------------------------------------------------------
 
 
@@ -274,15 +297,15 @@ def test_a_frozen_source_is_not_readopted(restarted: bool) -> None:
 @pytest.mark.parametrize(
     ("leaves", "mute", "on"),
     [
-        ("a", {"a": GO_ON, "b": FETCH}, "bc"),
-        ("b", {"b": FETCH}, "a"),
-        ("a", {"a": END}, "b"),
-        ("b", {"b": JOIN}, "ac"),
+        ("a", {"a": {GO_ON}, "b": {FETCH}}, "bc"),
+        ("b", {"b": {FETCH, REMOVE_COPY}}, "a"),
+        ("a", {"a": {END}}, "b"),
+        ("b", {"b": {JOIN}}, "ac"),
     ],
     ids=["source", "destination", "source, committed", "destination, committed"],
 )
 def test_the_plan_does_not_wait_for_a_slave_that_was_stopped(
-    leaves: str, mute: dict[str, str], on: str, then: str
+    leaves: str, mute: dict[str, set[str]], on: str, then: str
 ) -> None:
     """The slave has ended its processes. Under each policy the other instance runs at once.
 
@@ -290,8 +313,8 @@ def test_the_plan_does_not_wait_for_a_slave_that_was_stopped(
     frozen then.
     """
     cluster = story(then)
-    for name, executor in mute.items():
-        host(cluster, name).mute.add(executor)
+    for name, executors in mute.items():
+        host(cluster, name).mute |= executors
     cluster.migrate("p", "b")
     leave(cluster, leaves)
     wait(cluster, 1.0 if on == "a" else 3.0)

@@ -7,6 +7,7 @@ if all their bytes are, so the kernel need not track written pages.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import shutil
@@ -173,7 +174,8 @@ def _prepare(
     for folder, _, own in layers:
         (directory / folder).mkdir(mode=0o700, exist_ok=True)
         _write(directory / folder / name, [Pagemap(pagemap.magic, pid, own).encoded()])
-    os.link(images / pages, copy.directory / f"dumped-{pages}")
+    with contextlib.suppress(OSError):  # no hard links here, or a repeated dump of this attempt
+        os.link(images / pages, copy.directory / f"dumped-{pages}")
     return {f"{folder}/{file.name}": file.stat().st_size for folder, file, _ in layers}
 
 

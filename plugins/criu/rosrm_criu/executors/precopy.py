@@ -174,8 +174,9 @@ def _offer(
             attempts.check_wanted(asked.attempt)
             _sent[asked.source] = sent
     except BaseException:  # any error: no other code would close this end
-        sender.close()
+        # First the files, because the next attempt may soon use the same directory.
         artifacts.discard(directory)
+        sender.close()
         raise
     if former is not None:
         former.sender.close()

@@ -15,6 +15,7 @@ from rosrm.core.master.assignment.demands import ranking_of
 from rosrm.core.master.checkpoint import images
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration.blackout import changes_source
 from rosrm.core.master.migration.start import (
     move_of,
     planned,
@@ -220,7 +221,7 @@ def commit_to_image(
 def leave_behind(state: MasterState, migration: Migration, step: Execute) -> bool:
     """Return True if an executor step that cannot succeed is needless and may be skipped.
 
-    An instance that is still frozen on that host is killed when the host rejoins, not re-adopted.
+    An instance that may be frozen on that host is killed when the host rejoins, not re-adopted.
     """
     if migration.aim is Aim.CHECKPOINT:
         if migration.undo is None or migration.source.number not in migration.ended:
@@ -229,7 +230,11 @@ def leave_behind(state: MasterState, migration: Migration, step: Execute) -> boo
     elif not instances_are_gone(state, migration, step):
         return False
     process = state.processes[migration.process]
-    if process.left_behind is not None and process.left_behind.host == step.host:
+    left = process.left_behind
+    if left is None or left.host != step.host:
+        return True
+    is_source = left.number == migration.source.number
+    if not is_source or any(changes_source(migration, begun) for begun in migration.begun_steps):
         state.clear_left_behind(process)
         state.save(process)
     return True

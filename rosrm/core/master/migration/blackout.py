@@ -16,11 +16,14 @@ from rosrm.model.plan import Aim, Commit, Execute, ReportPhase, SetLifecycle, St
 def note_begun(migration: Migration, step: Step, now: float) -> None:
     """Note the beginning of a step; may be called again for a step."""
     is_new = migration.silent_at is None and migration.undo is None and not migration.committed
-    if is_new and step.undo is not None and _changes_source(step, migration):
+    if is_new and changes_source(migration, step):
         migration.silent_at = now
 
 
-def _changes_source(step: Step, migration: Migration) -> bool:
+def changes_source(migration: Migration, step: Step) -> bool:
+    """Return True if a step of the plan may stop, deactivate or freeze the source."""
+    if step.undo is None:
+        return False
     if isinstance(step, Execute):
         return step.host == migration.source_host.name
     return isinstance(step, Stop | SetLifecycle) and step.instance == migration.source

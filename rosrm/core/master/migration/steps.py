@@ -348,13 +348,16 @@ def _of_executor(state: MasterState, migration: Migration, step: Execute) -> Ste
 def instances_are_gone(state: MasterState, migration: Migration, step: Execute) -> bool:
     """Return True if a host is away, and its instances of a migration have ended or count as lost.
 
-    An executor there has no effect any more, and the host may never return.
+    An executor there has no effect any more, and the host may never return. A destination that was
+    never ordered to start does not count.
     """
     host = state.hosts.by_name[step.host]
     if migration.aim is not Aim.MOVE or state.hosts.condition_of(host) not in _AWAY:
         return False
-    process = state.processes[migration.process]
-    return all(one.host is not host for one in state.instances_of(process))
+    destination = migration.destination
+    unused = None if destination.number in migration.launched else destination
+    instances = state.instances_of(state.processes[migration.process])
+    return all(one.host is not host or one.id == unused for one in instances)
 
 
 def title(step: Step) -> str:
