@@ -144,7 +144,7 @@ def remove_copied_pages(
         for pid, ranges in copy.ranges.items():
             if ranges and (images / f"pagemap-{pid}.img").exists():
                 sizes |= _prepare(directory, copy, pid, check)
-    except BaseException:
+    except BaseException:  # any error, also of `check`: the dump must stay as it was
         shutil.rmtree(directory / PARENT, ignore_errors=True)
         for path in images.glob(f"*{_NEW}"):
             path.unlink()

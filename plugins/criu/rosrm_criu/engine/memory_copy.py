@@ -10,7 +10,9 @@ import mmap
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from io import FileIO
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -112,18 +114,12 @@ def copy(pids: Iterable[int], directory: Path, check: Callable[[], None]) -> Mem
 
 
 def _copy_one(pid: int, directory: Path, check: Callable[[], None]) -> list[PageRange]:
-    path = directory / file_name(inner_pid(pid))
-    path.touch(mode=0o600, exist_ok=False)
     copied: list[PageRange] = []
-    with (
-        path.open("wb", buffering=0) as file,
-        Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory,
-        Path(f"/proc/{pid}/pagemap").open("rb", buffering=0) as pagemap,
-    ):
+    with _opened(pid, directory / file_name(inner_pid(pid))) as (file, memory, pagemap):
         for begin, end, _ in _areas(pid):
-            for found in _held(pagemap.fileno(), begin, end):
+            for found in _held(pagemap, begin, end):
                 size = 0
-                for piece in _pieces(memory.fileno(), found):
+                for piece in _pieces(memory, found):
                     check()
                     file.write(piece)
                     size += len(piece)
@@ -162,16 +158,11 @@ def _copy_changes_of(
     before, row = pages_in(former.directory / file_name(inner)), 0
     changed = np.zeros(len(before), np.bool_)
     path = former.directory / CHANGES / file_name(inner)
-    path.touch(mode=0o600, exist_ok=False)
-    with (
-        path.open("wb", buffering=0) as file,
-        Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory,
-        Path(f"/proc/{pid}/pagemap").open("rb", buffering=0) as pagemap,
-    ):
+    with _opened(pid, path) as (file, memory, pagemap):
         for copied in former.ranges[inner]:
-            for found in _held(pagemap.fileno(), copied.begin, copied.end):
+            for found in _held(pagemap, copied.begin, copied.end):
                 at = row + (found.begin - copied.begin) // PAGE
-                for piece in _pieces(memory.fileno(), found):
+                for piece in _pieces(memory, found):
                     check()
                     pages = np.frombuffer(piece, np.uint64).reshape(-1, PAGE // 8)
                     after = at + len(pages)
@@ -180,6 +171,18 @@ def _copy_changes_of(
                     at = after
             row += copied.pages
     return changed
+
+
+@contextmanager
+def _opened(pid: int, path: Path) -> Iterator[tuple[FileIO, int, int]]:
+    """Yield a new file, and the descriptors of a process's memory and pagemap."""
+    path.touch(mode=0o600, exist_ok=False)
+    with (
+        path.open("wb", buffering=0) as file,
+        Path(f"/proc/{pid}/mem").open("rb", buffering=0) as memory,
+        Path(f"/proc/{pid}/pagemap").open("rb", buffering=0) as pagemap,
+    ):
+        yield file, memory.fileno(), pagemap.fileno()
 
 
 def _areas(pid: int) -> Iterator[tuple[int, int, int]]:
