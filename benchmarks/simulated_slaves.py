@@ -68,11 +68,10 @@ _AT_ONCE = 20
 #: Seconds between two rounds of cycles. Slaves that are due in that time are served together,
 #: because each poll for messages costs at least 60 us of waiting.
 _ROUND = 0.005
-#: Most turns of reception between two rounds; the seconds of a turn that received nothing; number
-#: of such turns after which the queues are empty.
+#: Most turns of reception between two rounds; number of turns without a callback after which the
+#: queues are empty.
 _TURNS = 1000
-_NOTHING = 50e-6
-_SLOW_TURNS = 3
+_IDLE_TURNS = 3
 #: Seconds between two cycles of a slave during start-up, which occupies the machine.
 _GENTLY = 0.25
 _LIMIT = 0.8
@@ -248,16 +247,14 @@ class Fleet:
     def _drain(self) -> None:
         """Process the received messages, also when the next cycles are due already.
 
-        Each turn takes at least one event, and answers to other slaves are events as well. One turn
-        for each round of cycles would let them pile up. A long turn received nothing or was
-        interrupted, so that only several in a row show that the queues are empty.
+        Each turn takes at least one event. Answers to slaves of another process are events as well,
+        but call no callback, so that only several such turns in a row show that the queues are
+        empty.
         """
-        slow = 0
+        idle = 0
         for _ in range(_TURNS):
-            began = time.monotonic()
-            self._shared.participant.spin(0.0)
-            slow = slow + 1 if time.monotonic() - began >= _NOTHING else 0
-            if slow == _SLOW_TURNS:
+            idle = 0 if self._shared.participant.spin(0.0) else idle + 1
+            if idle == _IDLE_TURNS:
                 break
 
     def _cycle(self, now: float) -> None:

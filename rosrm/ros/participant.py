@@ -123,18 +123,20 @@ class Participant:
 
         return call
 
-    def spin(self, timeout: float) -> None:
+    def spin(self, timeout: float) -> bool:
         """Wait for an event, at most `timeout` seconds, then handle all that are ready.
 
         Continuous events end it after `_FLOOD` seconds, because periodic work must not wait longer.
+        Return True if a callback was called.
         """
-        before = self._executed
+        first = before = self._executed
         self.executor.spin_once(timeout_sec=timeout)
         flooded = time.monotonic() + _FLOOD
         while self._executed != before and time.monotonic() < flooded:
             before = self._executed
             self.executor.spin_once(timeout_sec=0.0)
         self.guard.raise_interrupt()
+        return self._executed != first
 
     def wake(self) -> None:
         """End a waiting `spin`; may be called from any thread."""

@@ -44,6 +44,12 @@ def test_all_that_is_ready_is_one_group() -> None:
     assert executor.turns == [7.0, 0.0, 0.0, 0.0]
 
 
+def test_the_loop_reports_if_it_called_a_callback() -> None:
+    """A caller that empties its queues detects their end without measuring times."""
+    assert participant(ready=3)[0].spin(0.0)
+    assert not participant(ready=0)[0].spin(0.0)
+
+
 def test_a_flood_does_not_keep_a_part_from_its_other_work() -> None:
     """A master under continuous requests still sends its beats."""
     made, executor = participant(ready=None)
