@@ -9,6 +9,7 @@ runtimes import it. pydantic checks the files of users.
 from __future__ import annotations
 
 import json
+import marshal
 import types
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
@@ -30,6 +31,11 @@ _SCALARS: Final = (str, int, float, bool, type(None))
 _PLAIN: Final = frozenset(_SCALARS)
 #: Annotations of fields that are written unchanged; `json` refuses a value of another type.
 _PLAIN_HINTS: Final = ("str", "int", "float", "bool", str, int, float, bool)
+#: Format of `marshal` without references, so that equal values have equal bytes.
+_MARSHAL: Final = 2
+#: Most values of a field that are shared, and most bytes of each.
+_MOST_SHARED: Final = 64
+_LONGEST_SHARED: Final = 1000
 _JSON_OBJECT: Final = ("Mapping[str, Any]", Mapping[str, Any])
 
 
@@ -212,8 +218,35 @@ def _shape(kind: Any) -> _Shape:
     hints = hints_of(kind)
     known = [field for field in fields(kind) if field.init]
     required = [f.name for f in known if f.default is MISSING and f.default_factory is MISSING]
-    readers = {field.name: (hints[field.name], _reader(hints[field.name])) for field in known}
+    readers = {field.name: (hints[field.name], _field_reader(hints[field.name])) for field in known}
     return _Shape(readers, frozenset(required))
+
+
+def _field_reader(hint: Any) -> _Convert:
+    """Return the reader of a field; equal frozen dataclasses are read once, and then shared.
+
+    A restarted master reads thousands of specs, most of them with the same policies.
+    """
+    read = _reader(hint)
+    if not is_dataclass(hint) or not hint.__dataclass_params__.frozen:  # type: ignore[union-attr]
+        return read
+    known: dict[bytes, Any] = {}
+
+    def read_once(plain: Any) -> Any:
+        try:
+            exact = marshal.dumps(plain, _MARSHAL)  # unlike `==`, tells 1, 1.0 and True apart
+        except ValueError:  # another type than those of JSON
+            return read(plain)
+        found = known.get(exact)
+        if found is None:
+            found = read(plain)
+            if len(exact) <= _LONGEST_SHARED:
+                if len(known) >= _MOST_SHARED:
+                    known.clear()
+                known[exact] = found
+        return found
+
+    return read_once
 
 
 def _object_reader(kind: Any) -> _Convert:

@@ -84,6 +84,14 @@ def test_plain_values_of_another_shape_are_refused_by_name(plain, said):
         from_plain(Outer, plain)
 
 
+def test_equal_parts_are_read_once_but_never_for_another_type():
+    """A restart reads thousands of equal policies; a damaged one, equal for `==`, is refused."""
+    first, second = (from_plain(Outer, {"inner": {"number": 1}}).inner for _ in range(2))
+    assert first is second
+    with pytest.raises(ValueError, match=r"inner\.number"):
+        from_plain(Outer, {"inner": {"number": True}})
+
+
 def test_what_json_cannot_carry_is_refused():
     with pytest.raises(TypeError, match="a value of type object cannot be carried as JSON"):
         to_plain(object())
