@@ -143,8 +143,10 @@ def definition(function: object) -> str:
         return ""
 
 
-def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
+def _in_time(source: PluginSource, what: Callable[[], str], call: Callable[[], T]) -> T:
     """Return the answer of plugin code; warn when it is slow, and interrupt it when it hangs.
+
+    `what` returns the text for the code, which may have to be read from its file.
 
     Raises:
         TimeoutError: the code took longer than `LOADING_LIMIT`.
@@ -153,7 +155,7 @@ def _in_time(source: PluginSource, what: str, call: Callable[[], T]) -> T:
     def say() -> None:
         _log.warning(
             "%s is still being loaded after %g s: %s has not returned; it is ended after %g s",
-            source, SLOW_LOADING, what, LOADING_LIMIT,
+            source, SLOW_LOADING, what(), LOADING_LIMIT,
         )  # fmt: skip
 
     timer = threading.Timer(SLOW_LOADING, say)
@@ -173,7 +175,7 @@ def _load(
     kinds: Collection[PluginKind] | None = None,
 ) -> None:  # fmt: skip
     try:
-        plugin = _in_time(source, f"the import of {target}", load)
+        plugin = _in_time(source, lambda: f"the import of {target}", load)
         marked = _marked(plugin)
     except FAULTS as fault:
         loaded.broken.append(Broken(source, f"does not import: {describe_plugin_fault(fault)}"))
@@ -213,23 +215,26 @@ def _misspelt(plugin: object, marked: Mapping[str, Callable[..., Any]]) -> Itera
 
 def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..., Any]) -> None:
     kind, wanted = HOOKS[hook]
-    place = f"{hook} ({definition(function)})"
+
+    def place() -> str:
+        return f"{hook} ({definition(function)})"
+
     try:
         answer = _in_time(source, place, partial(_call, hook, function))
     except FAULTS as fault:
-        reason = f"{place} failed with {describe_plugin_fault(fault)}"
+        reason = f"{place()} failed with {describe_plugin_fault(fault)}"
         loaded.broken.append(Broken(source, reason, kind))
         return
     if isinstance(answer, str) or not isinstance(answer, Sequence):
         given = "None" if answer is None else type(answer).__name__
-        reason = f"{place} returned {given}, not a list of {wanted.__name__}"
+        reason = f"{place()} returned {given}, not a list of {wanted.__name__}"
         loaded.broken.append(Broken(source, reason, kind))
         return
     for offer in answer:
         fault_found = _fault_of(offer, wanted)
         if fault_found:
             name = str(getattr(offer, "name", ""))
-            loaded.broken.append(Broken(source, f"{place}: {fault_found}", kind, name))
+            loaded.broken.append(Broken(source, f"{place()}: {fault_found}", kind, name))
         else:
             loaded.offers.append(Offered(kind, offer, source))
 

@@ -79,6 +79,8 @@ _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
     "sink": "rosrm-alerts",
 }
 
+#: Kinds of the plugins that a master uses.
+MASTER_KINDS: Final[tuple[PluginKind, ...]] = ("scoring", "filter", "migration", "checkpoint")
 #: Kinds of the plugins that slaves use.
 SLAVE_KINDS: Final[tuple[PluginKind, ...]] = ("probe", "migration", "launcher")
 

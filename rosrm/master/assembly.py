@@ -7,7 +7,7 @@ from functools import partial
 
 from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
-from rosrm.extensions.registry import Registry
+from rosrm.extensions.registry import MASTER_KINDS, Registry
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
 from rosrm.master.settings_reload import SettingsReload
@@ -19,11 +19,11 @@ def new_runtime(
     config: ClusterConfig, handover: Handover, participant: Participant
 ) -> MasterRuntime:
     """Create the configured plugins, and return a master with them."""
-    registry = Registry.load(handover.plugins)
+    registry = Registry.load(handover.plugins, MASTER_KINDS)
     placement = placement_of(config, registry)
     strategies = registry.migrations(config.migration.strategies)
     checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
-    rows = registry.rows("scoring", "filter", "migration", "checkpoint")
+    rows = registry.rows(*MASTER_KINDS)
     placement = replace(placement, fallback=fallback_of(registry, config))
     declared = registry.declared(config.migration.strategies)
     reload = SettingsReload(config, handover.source, partial(chain_of, registry))
