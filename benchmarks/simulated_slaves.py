@@ -25,8 +25,9 @@ import socket
 import sys
 import time
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
+from functools import partial
 from typing import NoReturn
 
 import numpy as np
@@ -38,6 +39,7 @@ from rosrm.core.slave.events import (
     AssignmentsReceived,
     Event,
     MasterLost,
+    Registered,
     SupervisorReported,
     TimePassed,
 )
@@ -113,11 +115,15 @@ class Walks:
 
 
 class SimulatedSlave:
-    """A slave with simulated readings and processes."""
+    """A slave with simulated readings and processes; `joined` is called after its registration."""
 
-    def __init__(self, endpoints: BerthEndpoints, name: str, period: float, tally: Tally) -> None:
+    def __init__(
+        self, endpoints: BerthEndpoints, name: str, period: float, tally: Tally,
+        joined: Callable[[], None],
+    ) -> None:  # fmt: skip
         self.name = name
         self._tally = tally
+        self._joined = joined
         self._state = SlaveState()
         self._events: list[Event] = []
         resources = tuple(ResourceDescription(*one) for one in _RESOURCES)
@@ -169,6 +175,8 @@ class SimulatedSlave:
         """Queue an event; process assignments at once, as a slave's loop does."""
         self._events.append(event)
         self._tally.lost += isinstance(event, MasterLost)
+        if isinstance(event, Registered):
+            self._joined()
         if isinstance(event, AssignmentsReceived):
             self.work(time.monotonic())
 
@@ -202,6 +210,7 @@ class Fleet:
         self._walks = Walks(count, step)
         self._shared = SharedParticipant(settings, f"rosrm_simulated_{first}", self.tally)
         self._due: list[tuple[float, int]] = []
+        self._joined: list[int] = []
 
     def bring_up(self, timeout: float) -> None:
         """Make and register all slaves, a few at a time.
@@ -228,7 +237,8 @@ class Fleet:
         for index in range(len(self.slaves), min(len(self.slaves) + _AT_ONCE, self._count)):
             name = f"sim{self._first + index:05d}"
             endpoints = BerthEndpoints(self._shared, _security(self._security, name))
-            slave = SimulatedSlave(endpoints, name, self._period, self.tally)
+            joined = partial(self._joined.append, index)
+            slave = SimulatedSlave(endpoints, name, self._period, self.tally, joined)
             self.slaves.append(slave)
             # Spread over the period, as the cycles of separate slaves are.
             heapq.heappush(self._due, (now + self._period * index / self._count, index))
@@ -243,6 +253,8 @@ class Fleet:
             wake = max(now + _ROUND, self._due[0][0]) if self._due else end
             while (left := min(end, wake) - time.monotonic()) > 0.0:
                 self._shared.participant.spin(left)
+                while self._joined:  # a real slave sends its first reading at once, too
+                    self._work_for(self._joined.pop(), time.monotonic())
 
     def _drain(self) -> None:
         """Process the received messages, also when the next cycles are due already.
@@ -265,6 +277,9 @@ class Fleet:
         heapq.heapreplace(self._due, (due + self._pace, index))
         if index == 0:  # its next cycle comes after one of each other slave
             self._walks.go_on()
+        self._work_for(index, now)
+
+    def _work_for(self, index: int, now: float) -> None:
         slave = self.slaves[index]
         slave.cycle(self._walks.usage_of(index), self._walks.limit, now)
         self.tally.cycles += slave.registered

@@ -374,9 +374,12 @@ class SlaveRuntime:
             self._work(now)
             wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
             wake = min(wake, next_health) if self._health.watches else wake
+            was_registered = self._is_registered
             self._participant.spin(max(0.0, wake - time.monotonic()))
             now = time.monotonic()
             self._work(now)
+            if self._is_registered and not was_registered:
+                self._cycle(now)  # the master gives no work before the first reading
             guard.call(self._services.acknowledge_starts)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)

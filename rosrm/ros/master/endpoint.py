@@ -117,7 +117,10 @@ class MasterEndpoint:
             queued: False if no process is queued. Then requests for work decide nothing, and the
                 readings can wait for the next tick.
         """
-        if not self._begin_with_readings() and (queued or not self._are_requests_for_work()):
+        # A request for work waits for the first reading of its slave, which was sent before.
+        if self.links.awaits_readings or (
+            not self._begin_with_readings() and (queued or not self._are_requests_for_work())
+        ):
             self._guard.call(self._take_readings)
         events = list(self.events)
         self.events.clear()

@@ -234,6 +234,11 @@ class HostLinks:
         link.close_poll()
         self.reading_stats.forget(link.host_id)
 
+    @property
+    def awaits_readings(self) -> bool:
+        """Return True if orders or requests wait for the first reading of a slave."""
+        return bool(self._waiting)
+
     def reading_received(self, host_ids: Iterable[int]) -> None:
         """Send the orders that waited for readings of these hosts."""
         for host_id in self._waiting.intersection(host_ids) if self._waiting else ():

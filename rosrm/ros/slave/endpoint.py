@@ -344,6 +344,8 @@ class SlaveEndpoint:
                 return
             self._lose_master(f"the master has started again (epoch {beat.epoch})")
         self._newest_beat = beat
+        if self.link is MasterLink.SEARCHING:  # do not wait for the next cycle
+            self.advance(now)
         if not self._is_of_master(beat) or self._beat_clock.is_ahead(beat.beat / 1e9, now):
             return
         self._endpoints.security.note_beat(beat.tickets_from)

@@ -159,6 +159,14 @@ def test_another_run_of_the_master_is_reported_at_any_epoch(slave, epoch) -> Non
     assert slave.newest(srv.RequestProcess).request.envelope.epoch == epoch
 
 
+def test_another_run_gets_a_handshake_at_its_first_beat(slave) -> None:
+    """After a restart of the master, its hosts must not wait for their next cycles."""
+    slave.join(Master(slave, 11))
+    slave.clock.now += 1.0
+    Master(slave, 12, epoch=2, pid=8).beat()
+    assert len(slave.sent(srv.Handshake)) == 2
+
+
 def test_another_run_is_reported_without_a_contact_with_the_first(slave) -> None:
     """The first run is killed right after its greeting, which does not identify the run."""
     old, new = Master(slave, 11), Master(slave, 12, pid=8)
