@@ -74,13 +74,18 @@ def wait_for_service(participant: Participant, client: Any, deadline: float) -> 
     return True
 
 
-def wait_until(participant: Participant, done: Callable[[], bool], deadline: float) -> bool:
-    """Return True if `done` becomes true before `deadline` (monotonic seconds)."""
+def wait_until(
+    participant: Participant, done: Callable[[], bool], deadline: float, look: float = 0.1
+) -> bool:
+    """Return True if `done` becomes true before `deadline` (monotonic seconds).
+
+    `look`: most seconds between two calls of `done`, which each message calls as well.
+    """
     while not done():
         left = deadline - time.monotonic()
         if left <= 0.0:
             return False
-        _spin(participant, min(left, 0.1))
+        _spin(participant, min(left, look))
     return True
 
 
@@ -141,40 +146,49 @@ def find_master(endpoints: Endpoints, who: str, timeout: float) -> srv.Handshake
 def _shake_hands(
     participant: Participant, client: SealedClient, who: str, deadline: float
 ) -> srv.Handshake.Response | None:
-    """Return the master's description of itself; None: no answer before the deadline."""
+    """Return the master's description of itself; None: no answer before the deadline.
+
+    The handshake is repeated when DDS discovers another server, because the services of a killed
+    master look ready until its DDS lease ends.
+    """
     role, _, name = who.partition(" ")
     request = srv.Handshake.Request(
         protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
     )
-    return _ask_until_answered(participant, client, request, deadline, _GREET_AGAIN).answer
+    return _ask_until_answered(
+        participant, client, request, deadline, _GREET_AGAIN, servers=client.servers, look=_LOOK
+    ).answer
 
 
 def _ask_until_answered(
     participant: Participant, client: Any, request: Any, deadline: float, again: float,
-    on_wait: OnWait | None = None,
+    on_wait: OnWait | None = None, *, servers: Callable[[], int] = int, look: float = 0.1,
 ) -> _Answers:  # fmt: skip
     """Repeat a request until `deadline`; return the first answer.
 
-    `on_wait` is called about every 0.1 s with the seconds since the first request.
+    `on_wait` is called about every `look` seconds with the seconds since the first request.
+    `servers` returns the number of discovered servers; another number repeats the request at once.
 
     A server sends no answer before it has discovered the client's reader, and a new client's
     request may arrive earlier.
     """
     answers, began = _Answers(), time.monotonic()
+    known = 0
 
-    def answered() -> bool:
+    def ended() -> bool:
         if not answers.first and on_wait is not None:
             on_wait(time.monotonic() - began)
-        return bool(answers.first)
+        return bool(answers.first) or servers() != known
 
     while not answers.first:
         now = time.monotonic()
         if now >= deadline:
             return answers
+        known = servers()
         answers.sent += 1
         with signals_deferred():
             client.call_async(request).add_done_callback(participant.counted(answers.take))
-        wait_until(participant, answered, min(deadline, now + again))
+        wait_until(participant, ended, min(deadline, now + again), look)
     return answers
 
 

@@ -385,6 +385,7 @@ class SealedClient:
         refused: Callable[[], None],
     ) -> None:  # fmt: skip
         self._participant = participant
+        self._name = name
         self.peer = peer
         self.first_contact = False
         self._refused = refused
@@ -423,6 +424,10 @@ class SealedClient:
         if self.first_contact:
             peer.run = envelope.run
         future.set_result(_plain(self._response_type, plain))
+
+    def servers(self) -> int:
+        """Return the number of discovered servers, also of those that were killed a moment ago."""
+        return int(self._participant.node.count_services(self._name))
 
     def destroy(self) -> None:
         """Destroy the client."""
