@@ -13,8 +13,9 @@ import rclpy
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from rosrm.model.ros_settings import RosSettings
 from rosrm.ros.peer_announcements import request_announcements
-from rosrm.testing.local_cluster import claim_domain
+from rosrm.testing.local_cluster import LocalCluster, claim_domain
 from tests.waiting import PATIENCE, wait_until
 
 #: A port of discovery that no participant of a test reaches: the 31st of its domain.
@@ -62,6 +63,19 @@ def peer(node, tmp_path):
     finally:
         process.kill()
         process.wait(PATIENCE)
+
+
+def test_a_starting_master_requests_announcements(tmp_path):
+    """Slaves announce themselves every second; a restarted master must not wait for that."""
+    domain, claim = claim_domain()
+    cluster = LocalCluster(tmp_path, joining=RosSettings(domain, "localhost"))
+    port = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    with claim, port, closing(cluster):
+        port.bind(("127.0.0.1", PORT + 250 * domain))
+        port.settimeout(PATIENCE)
+        cluster.start_master()
+        while port.recv(65536)[6:8] != bytes(2):  # the vendor: none is that of the request
+            pass
 
 
 def test_a_peer_announces_itself_again_on_request(node, peer):
