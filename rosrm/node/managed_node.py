@@ -108,6 +108,11 @@ class NodeEntities:
             return name
         return f"{self.visible_node}/{resolved[len(own) :]}"
 
+    @property
+    def is_replaying(self) -> bool:
+        """Return True while buffered messages may be left; new messages then queue behind them."""
+        return self._replay.is_on
+
     def _new_buffer(self) -> InputBuffer:
         return InputBuffer(BUFFER_LIMIT, BUFFER_BYTES, time.monotonic())
 
@@ -227,7 +232,7 @@ class NodeEntities:
 
     def _received(self, one: Input, message: Any, info: Any) -> None:
         with self.turn:
-            if one.buffered and (self.mode is not Mode.ACTIVE or self._replay.is_on):
+            if one.buffered and (self.mode is not Mode.ACTIVE or self.is_replaying):
                 self._keep(one, message, info)
                 if self._may_catch_up(one):
                     self._catch_up(one)
@@ -281,7 +286,7 @@ class NodeEntities:
 
     def serve_what_has_come(self, then: Callable[[], None]) -> None:
         """Serve received messages, which a later shadow does not receive; then call `then`."""
-        if not self._replay.is_on:
+        if not self.is_replaying:
             self.catch_up()
         if self.buffer:
             self._replay.serve(len(self.buffer), then)

@@ -245,6 +245,28 @@ def test_a_source_in_cpp_closes_its_services_one_by_one(stage, cpp_node_class, m
     assert len(set(closed)) == len(closed)
 
 
+def test_a_source_falls_silent_at_the_end_of_a_cycle(stage, counter, monkeypatch):
+    """Then the time until its next input is longest, and the successor is active before it."""
+    monkeypatch.setattr(source, "_CYCLE_PATIENCE", 600.0)
+    wake = cpp_node._Core._wake
+    monkeypatch.setattr(  # no alarm of a source in C++ rings
+        cpp_node._Core, "_wake", lambda core: core._node.get_name() == "counter" or wake(core)
+    )
+    pair = pair_of(stage, partial(counter, period=600.0))
+    talker = stage.plain.create_publisher(Int64, "add", RELIABLE)
+    pair.conductor.prepare()
+    pair.conductor.say(C.SWITCH)
+    pair.conductor.wait(2, R.SWITCHING)
+    stage.plain.create_timer(0.1, lambda: talker.publish(Int64(data=1)))
+    pair.conductor.wait(1, R.SILENT)
+    assert pair.first.total >= 1
+
+
+def test_an_idle_source_falls_silent_without_a_cycle(stage, counter):
+    """A node that waits for its inputs can be moved."""
+    pair_of(stage, partial(counter, period=600.0)).conductor.hand_over()
+
+
 def _servers(stage, name):
     """Return the nodes that serve a name, according to the graph."""
     return [

@@ -33,6 +33,9 @@ _LOOK: Final = 0.05
 #: the domain. Closing all seven of a node at once kept two cores busy for 10 ms, which delayed the
 #: first outputs of the successor.
 _CLOSE_EVERY: Final = 0.02
+#: Seconds for which a source that may fall silent waits for the end of a cycle. If its inputs come
+#: at a rate, the time until the next one is longest then.
+_CYCLE_PATIENCE: Final = 0.1
 _AT_ONCE: Final = Duration(nanoseconds=0)
 #: Returned by `next` after the last service is closed.
 _END: Final = object()
@@ -50,6 +53,7 @@ class HandoffSource:
         self._may_switch = False
         self._asked = False
         self._finishing = False
+        self._cycle_timer: Any = None
         self._fault = ""
         self._timers_due: list[int] = []
         self._silent_since = 0.0
@@ -82,6 +86,8 @@ class HandoffSource:
             self._show()
         if self._keeper is not None:
             self._keeper.after_cycle()
+        if not self._entities.is_replaying:  # a replay counts its messages between two cycles
+            self._finish()
 
     def _show(self, *, last: bool = False) -> bool:
         """Publish the state between two cycles, and the mark that lists the covered inputs.
@@ -197,12 +203,24 @@ class HandoffSource:
             self._channel.report(HandoffReport.ATTACHED, self._entities.sequence)
 
     def _switch(self) -> None:
-        """Fall silent, once both the master and the destination have requested it."""
+        """Fall silent after the next cycle, once master and destination have requested it."""
         if self._channel is None or not (self._may_switch and self._asked) or self._fault:
             return
         if self._entities.mode is Mode.ACTIVE and not self._finishing:
             self._finishing = True
-            self._entities.serve_what_has_come(self._fall_silent)
+            self._cycle_timer = steady_timer(self._entities.plain, _CYCLE_PATIENCE, self._finish)
+
+    def _finish(self) -> None:
+        """Serve received messages and fall silent, if this node waits for the end of a cycle."""
+        with self._entities.turn:
+            if self._cycle_timer is not None:
+                self._stop_cycle_timer()
+                self._entities.serve_what_has_come(self._fall_silent)
+
+    def _stop_cycle_timer(self) -> None:
+        if self._cycle_timer is not None:
+            self._entities.plain.destroy_timer(self._cycle_timer)
+            self._cycle_timer = None
 
     def _fall_silent(self) -> None:
         entities, wanted = self._entities, self._finishing
@@ -237,6 +255,7 @@ class HandoffSource:
 
     def _call_off(self) -> None:
         self._may_switch = self._asked = self._attached = self._finishing = False
+        self._stop_cycle_timer()
         self._stop_release()
 
     def _resume(self) -> None:

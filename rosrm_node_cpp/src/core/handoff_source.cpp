@@ -16,6 +16,9 @@ constexpr double kAckPatience = 4.0;
 constexpr double kLook = 0.05;
 /// Seconds between the closing of two services, because each one is announced to every participant.
 constexpr double kCloseEvery = 0.02;
+/// Seconds for which a source that may fall silent waits for the end of a cycle. If its inputs come
+/// at a rate, the time until the next one is longest then.
+constexpr double kCyclePatience = 0.1;
 
 std::uint64_t random_number()
 {
@@ -74,6 +77,9 @@ void HandoffSource::after_cycle()
   }
   if (saver_) {
     saver_->after_cycle();
+  }
+  if (cycle_alarm_ != 0 && !entities_.is_replaying()) {  // it counts between two cycles
+    finish();
   }
 }
 
@@ -224,7 +230,7 @@ void HandoffSource::attach()
   }
 }
 
-/// Fall silent, once both the master and the destination have requested it.
+/// Fall silent after the next cycle, once master and destination have requested it.
 void HandoffSource::switch_over()
 {
   if (!channel_ || !(may_switch_ && asked_) || !fault_.empty()) {
@@ -232,8 +238,15 @@ void HandoffSource::switch_over()
   }
   if (entities_.mode == Mode::kActive && !finishing_) {
     finishing_ = true;
-    entities_.serve_what_has_come([this] {fall_silent();});
+    cycle_alarm_ = entities_.alarms.start(kCyclePatience, [this] {finish();});
   }
+}
+
+/// Serve received messages and fall silent.
+void HandoffSource::finish()
+{
+  entities_.alarms.stop(cycle_alarm_);
+  entities_.serve_what_has_come([this] {fall_silent();});
 }
 
 void HandoffSource::fall_silent()
@@ -271,6 +284,7 @@ void HandoffSource::release()
 void HandoffSource::call_off()
 {
   may_switch_ = asked_ = attached_ = finishing_ = false;
+  entities_.alarms.stop(cycle_alarm_);
   entities_.alarms.stop(release_alarm_);
 }
 

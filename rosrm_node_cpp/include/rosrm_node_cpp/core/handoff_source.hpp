@@ -53,6 +53,7 @@ private:
   void close_next_service();
   void attach();
   void switch_over();
+  void finish();
   void fall_silent();
   void release();
   void call_off();
@@ -81,6 +82,7 @@ private:
   std::string fault_;
   std::vector<std::int64_t> timers_due_;
   double silent_since_ = 0.0;
+  int cycle_alarm_ = 0;
   int release_alarm_ = 0;
   int ask_alarm_ = 0;
   int closing_alarm_ = 0;
