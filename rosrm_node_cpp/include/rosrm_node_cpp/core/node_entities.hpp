@@ -146,6 +146,9 @@ public:
   /// Return an input that has lost a message and needs every one; "" if there is none.
   std::string input_with_gap();
 
+  /// Return true while buffered messages may be left; new messages then queue behind them.
+  bool is_replaying() const {return replay_ != 0;}
+
   /// Serve received messages, which a later shadow does not receive; then call `then`.
   void serve_what_has_come(std::function<void()> then);
 
@@ -180,7 +183,6 @@ public:
 private:
   InputBuffer new_buffer();
   bool is_late(const Input & input, const Sent & sent);
-  bool is_replaying() const {return replay_ != 0;}
   void replay();
   bool serve_until(double end);
   bool serve_next();
