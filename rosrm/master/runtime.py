@@ -398,6 +398,7 @@ class MasterRuntime:
             return
         self._state.wall = time.time()
         core_now, spent = self._core_now(now), self._deadlines.spent
+        self._endpoint.poll_first_readings()
         while self._held is None and (events := self._take_events()):
             commands: list[Command] = []
             for event in events:

@@ -13,6 +13,7 @@ import os
 import socket
 import struct
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Final
 
 from rosrm.ros.graph_remains import open_sockets
@@ -46,7 +47,8 @@ _UDP_V4: Final = 1
 def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
     """Make all peers send their announcements to the participants of this process.
 
-    Nothing is sent if no socket of this process has a default port, for example without UDP.
+    Nothing is sent if no socket of this process has a default port, for example without UDP. No
+    failure is reported: without the request, discovery only takes longer.
 
     Args:
         domain: ROS domain of the participants.
@@ -62,7 +64,7 @@ def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
     ]  # fmt: skip
     if not ports:
         return
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender, suppress(OSError):
         if first in bound:
             _send_to_group(sender, (_GROUP, first), ports)
         elif environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST":
@@ -73,10 +75,10 @@ def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
 
 def _send_to_group(sender: socket.socket, group: tuple[str, int], ports: Sequence[int]) -> None:
     for address in reachable_addresses():
-        sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(address))
         try:
+            sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(address))
             sender.sendto(announcement(address, ports), group)
-        except OSError:  # an interface that is down, or has no multicast
+        except OSError:  # an interface that is down or gone, or has no multicast
             continue
 
 

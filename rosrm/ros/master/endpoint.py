@@ -104,6 +104,14 @@ class MasterEndpoint:
         self._guard.call(self._take_readings)
         self._oldest.append(self.links.reading_stats.ages(time.monotonic())[1])
 
+    def poll_first_readings(self) -> None:
+        """Take new readings if requests of slaves wait for them; called once before `take_events`.
+
+        A slave sends its first reading before its first request for work.
+        """
+        if self.links.awaits_first_readings:
+            self._guard.call(self._take_readings)
+
     def _take_readings(self) -> None:
         readings = self._subscriptions.poll_readings()
         if readings is not None:
@@ -117,10 +125,7 @@ class MasterEndpoint:
             queued: False if no process is queued. Then requests for work decide nothing, and the
                 readings can wait for the next tick.
         """
-        # A request for work waits for the first reading of its slave, which was sent before.
-        if self.links.awaits_readings or (
-            not self._begin_with_readings() and (queued or not self._are_requests_for_work())
-        ):
+        if not self._begin_with_readings() and (queued or not self._are_requests_for_work()):
             self._guard.call(self._take_readings)
         events = list(self.events)
         self.events.clear()

@@ -40,6 +40,8 @@ _MOST_INTRODUCTIONS: Final = 100
 #: Seconds after a registration in which DDS discovers the service of a slave, if it does at all.
 #: Later orders skip the check, in which rmw searches the endpoints of all hosts (4 ms for 1,000).
 _DISCOVERY: Final = 30.0
+#: Seconds after a registration in which the first reading of the slave arrives, if it does at all.
+_FIRST_READING: Final = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,6 +142,7 @@ class HostLinks:
         # Of a thousand links few have pending work, so only those are checked.
         self._waiting: set[int] = set()
         self._with_work: set[int] = set()
+        self._first_readings_until = -math.inf
         self.reading_stats = ReadingStats()
         self.decided_at = 0
 
@@ -184,6 +187,7 @@ class HostLinks:
             self._links[host_id] = link
         link.slave = slave
         link.search()
+        self._first_readings_until = link.searched_from + _FIRST_READING
         link.close_poll()
         if link.incarnation == description.incarnation:
             # The same run again: assignments that it has not fetched stay valid. But it was
@@ -235,9 +239,9 @@ class HostLinks:
         self.reading_stats.forget(link.host_id)
 
     @property
-    def awaits_readings(self) -> bool:
-        """Return True if orders or requests wait for the first reading of a slave."""
-        return bool(self._waiting)
+    def awaits_first_readings(self) -> bool:
+        """Return True if orders or requests wait for a slave that registered a moment ago."""
+        return bool(self._waiting) and time.monotonic() < self._first_readings_until
 
     def reading_received(self, host_ids: Iterable[int]) -> None:
         """Send the orders that waited for readings of these hosts."""

@@ -37,12 +37,30 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
     master._state, master._behind = SimpleNamespace(queue=[]), 0.0
     master._recorder = master._held = None
     master._deadlines = clock
-    master._endpoint = SimpleNamespace(take_events=lambda queued: events.pop(0))
+    master._endpoint = SimpleNamespace(
+        take_events=lambda queued: events.pop(0), poll_first_readings=lambda: None
+    )
     monkeypatch.setattr(master, "_now", lambda: clock.now)
     master._take_in(clock.now)
     clock.now += 0.05
     assert clock.decided == [100.0]
     assert master._core_now(clock.now) == pytest.approx(100.0 + passed)
+
+
+def test_awaited_readings_are_polled_once_in_a_turn(monkeypatch) -> None:
+    """Otherwise slaves that report without a pause would keep the master from its beats."""
+    polls, events = [], [["registered"], ["asked"], []]
+    monkeypatch.setattr(runtime, "step", lambda *_: [])
+    master = MasterRuntime.__new__(MasterRuntime)
+    master._state, master._behind = SimpleNamespace(queue=[]), 0.0
+    master._recorder = master._held = None
+    master._deadlines = SimpleNamespace(spent=0.0)
+    master._endpoint = SimpleNamespace(
+        take_events=lambda queued: events.pop(0), poll_first_readings=lambda: polls.append(1)
+    )
+    monkeypatch.setattr(master, "_now", lambda: 0.0)
+    master._take_in(0.0)
+    assert (polls, events) == ([1], [])
 
 
 @pytest.mark.parametrize(("loss", "wait"), [(100.02, 0.02), (99.0, 0.005), (float("inf"), 0.05)])

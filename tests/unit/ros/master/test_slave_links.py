@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from types import SimpleNamespace
 
@@ -151,6 +152,18 @@ def test_waiting_requests_of_one_slave_are_bounded(links):
         links.after_first_reading(link, partial(sent.append, number))
     receive_reading(links, beat=100, sequence=1)
     assert sent == list(range(200, 1200))
+
+
+def test_readings_are_polled_for_a_slave_only_a_moment_after_its_registration(links, monkeypatch):
+    """A request of a slave that has died since waits for ever, and must not occupy the master."""
+    now = time.monotonic()
+    monkeypatch.setattr("time.monotonic", lambda: now)
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    before = links.awaits_first_readings
+    links.after_first_reading(links.registered(HOST), lambda: None)
+    during = links.awaits_first_readings
+    now += 1.0
+    assert (before, during, links.awaits_first_readings) == (False, True, False)
 
 
 def test_introductions_take_no_place_of_an_order(links):
