@@ -68,7 +68,7 @@ _LOOK = 0.05
 #: endpoint with all others.
 _AT_ONCE = 20
 #: Seconds between two rounds of cycles. Slaves that are due in that time are served together,
-#: because each poll for messages costs at least 60 us of waiting.
+#: because each poll for messages costs at least 25 us.
 _ROUND = 0.005
 #: Most turns of reception between two rounds; number of turns without a callback after which the
 #: queues are empty.

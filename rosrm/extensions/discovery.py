@@ -146,7 +146,7 @@ def definition(function: object) -> str:
 def _in_time(source: PluginSource, what: Callable[[], str], call: Callable[[], T]) -> T:
     """Return the answer of plugin code; warn when it is slow, and interrupt it when it hangs.
 
-    `what` returns the text for the code, which may have to be read from its file.
+    `what` returns a description of the code; only warnings call it, because it may read a file.
 
     Raises:
         TimeoutError: the code took longer than `LOADING_LIMIT`.

@@ -74,7 +74,7 @@ def test_a_starting_master_requests_announcements(tmp_path):
         port.bind(("127.0.0.1", PORT + 250 * domain))
         port.settimeout(PATIENCE)
         cluster.start_master()
-        while port.recv(65536)[6:8] != bytes(2):  # the vendor: none is that of the request
+        while port.recv(65536)[6:8] != bytes(2):  # the request has the vendor 0
             pass
 
 

@@ -33,8 +33,8 @@ _LOOK: Final = 0.05
 #: the domain. Closing all seven of a node at once kept two cores busy for 10 ms, which delayed the
 #: first outputs of the successor.
 _CLOSE_EVERY: Final = 0.02
-#: Seconds for which a source that may fall silent waits for the end of a cycle. If its inputs come
-#: at a rate, the time until the next one is longest then.
+#: Most seconds that a source waits for the end of a cycle before it becomes silent. Right after a
+#: cycle, the time until the next periodic input is longest.
 _CYCLE_PATIENCE: Final = 0.1
 _AT_ONCE: Final = Duration(nanoseconds=0)
 #: Returned by `next` after the last service is closed.

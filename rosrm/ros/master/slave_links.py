@@ -40,7 +40,7 @@ _MOST_INTRODUCTIONS: Final = 100
 #: Seconds after a registration in which DDS discovers the service of a slave, if it does at all.
 #: Later orders skip the check, in which rmw searches the endpoints of all hosts (4 ms for 1,000).
 _DISCOVERY: Final = 30.0
-#: Seconds after a registration in which the first reading of the slave arrives, if it does at all.
+#: Seconds after a registration during which the master polls for the first reading of the slave.
 _FIRST_READING: Final = 1.0
 
 

@@ -16,8 +16,8 @@ constexpr double kAckPatience = 4.0;
 constexpr double kLook = 0.05;
 /// Seconds between the closing of two services, because each one is announced to every participant.
 constexpr double kCloseEvery = 0.02;
-/// Seconds for which a source that may fall silent waits for the end of a cycle. If its inputs come
-/// at a rate, the time until the next one is longest then.
+/// Most seconds that a source waits for the end of a cycle before it becomes silent. Right after a
+/// cycle, the time until the next periodic input is longest.
 constexpr double kCyclePatience = 0.1;
 
 std::uint64_t random_number()

@@ -48,7 +48,7 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
 
 
 def test_awaited_readings_are_polled_once_in_a_turn(monkeypatch) -> None:
-    """Otherwise slaves that report without a pause would keep the master from its beats."""
+    """Otherwise slaves that report without a pause would delay the beats of the master."""
     polls, events = [], [["registered"], ["asked"], []]
     monkeypatch.setattr(runtime, "step", lambda *_: [])
     master = MasterRuntime.__new__(MasterRuntime)

@@ -85,7 +85,7 @@ def test_plain_values_of_another_shape_are_refused_by_name(plain, said):
 
 
 def test_equal_parts_are_read_once_but_never_for_another_type():
-    """A restart reads thousands of equal policies; a damaged one, equal for `==`, is refused."""
+    """A restart reads thousands of equal policies. `True` is refused although it equals 1."""
     first, second = (from_plain(Outer, {"inner": {"number": 1}}).inner for _ in range(2))
     assert first is second
     with pytest.raises(ValueError, match=r"inner\.number"):
