@@ -225,7 +225,8 @@ def _shape(kind: Any) -> _Shape:
 def _field_reader(hint: Any) -> _Convert:
     """Return the reader of a field; equal frozen dataclasses are read once, and then shared.
 
-    A restarted master reads thousands of specs, most of them with the same policies.
+    A restarted master reads thousands of specs, most of them with the same policies. Those with
+    mappings are not shared, because a plugin could change a mapping.
     """
     read = _reader(hint)
     if not is_dataclass(hint) or not hint.__dataclass_params__.frozen:  # type: ignore[union-attr]
@@ -233,6 +234,8 @@ def _field_reader(hint: Any) -> _Convert:
     known: dict[bytes, Any] = {}
 
     def read_once(plain: Any) -> Any:
+        if isinstance(plain, dict) and dict in map(type, plain.values()):
+            return read(plain)
         try:
             exact = marshal.dumps(plain, _MARSHAL)  # unlike `==`, tells 1, 1.0 and True apart
         except ValueError:  # another type than those of JSON

@@ -56,6 +56,11 @@ def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
     """
     if environment.get("ROS_DISCOVERY_SERVER"):
         return  # the discovery server sends its clients what they need
+    with suppress(OSError):
+        _request(domain, environment)
+
+
+def _request(domain: int, environment: Mapping[str, str]) -> None:
     first = _FIRST_PORT + _PORTS_OF_A_DOMAIN * domain
     bound = set(_bound_ports())
     ports = [
@@ -64,7 +69,7 @@ def request_announcements(domain: int, environment: Mapping[str, str]) -> None:
     ]  # fmt: skip
     if not ports:
         return
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender, suppress(OSError):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         if first in bound:
             _send_to_group(sender, (_GROUP, first), ports)
         elif environment.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "LOCALHOST":

@@ -13,6 +13,7 @@ import pytest
 
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.model.codec import from_plain, to_plain
+from rosrm.model.values import ProcessSpec
 
 
 def test_settings_and_registry_import_without_pydantic_yaml_or_typer():
@@ -90,6 +91,14 @@ def test_equal_parts_are_read_once_but_never_for_another_type():
     assert first is second
     with pytest.raises(ValueError, match=r"inner\.number"):
         from_plain(Outer, {"inner": {"number": True}})
+
+
+def test_parts_with_a_mapping_are_not_shared():
+    """A plugin that changed the options of one process would change those of others."""
+    plain = {"name": "p", "command": ["x"], "migration": {"options": {"list": [1]}}}
+    first, second = (from_plain(ProcessSpec, plain).migration for _ in range(2))
+    assert first == second
+    assert first is not second
 
 
 def test_what_json_cannot_carry_is_refused():
