@@ -20,8 +20,6 @@ from functools import cache, partial
 from itertools import groupby
 from typing import Any, Final
 
-from rclpy.serialization import serialize_message
-
 from rosrm.model.remembered import remembered
 from rosrm_msgs import msg
 
@@ -225,8 +223,13 @@ def form_of(message: Any) -> bytes:
     """Return the CDR form of a message of rosrm: by `written` if its type contains a spec.
 
     For other types rclpy is faster, such as long lists of flat messages (the rows of a listing).
+    Requests have no such lists, and a client may need no rclpy.
     """
-    return written(message) if _has_specs(type(message)) else bytes(serialize_message(message))
+    if type(message).__name__.endswith("_Request") or _has_specs(type(message)):
+        return written(message)
+    from rclpy.serialization import serialize_message  # noqa: PLC0415 - see above
+
+    return bytes(serialize_message(message))
 
 
 def _find_specs(kind: Any) -> bool:

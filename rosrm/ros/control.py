@@ -14,18 +14,20 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.errors import Refused
 from rosrm.keys.links import Link
 from rosrm.keys.security import Peer
 from rosrm.ros.bounds import MOST_LETTERS
-from rosrm.ros.participant import Participant, failed_response
-from rosrm.ros.sealed import SealedEndpoints, SealedRequest
+from rosrm.ros.sealed import SealedEndpoints, SealedRequest, failed_response
 from rosrm.version import PROTOCOL_VERSION
 from rosrm.wording import sendable
 from rosrm_msgs.msg import Answer, Envelope, MasterBeat
 from rosrm_msgs.srv import Handshake
+
+if TYPE_CHECKING:
+    from rosrm.ros.participant import Participant
 
 #: Ids of one sender that are remembered at least, for late repetitions, and at most. An id is never
 #: forgotten while a copy of its request is young enough to be admitted.
@@ -69,6 +71,14 @@ def refused(code: str, message: str, epoch: int = 0) -> Answer:
 def master_identity(message: MasterBeat | Handshake.Response) -> tuple[str, int, int]:
     """Return the identity of a master, as far as a greeting contains it, too."""
     return message.hostname, message.pid, message.epoch
+
+
+def new_envelope(sender: str, receiver_beat: int, epoch: int) -> Envelope:
+    """Return the envelope of a new request."""
+    return Envelope(
+        protocol_version=PROTOCOL_VERSION, request_id=os.urandom(16).hex(), sender=sender,
+        epoch=epoch, receiver_beat=receiver_beat,
+    )  # fmt: skip
 
 
 def check_answer(answer: Answer, who: str) -> None:
@@ -266,10 +276,7 @@ class ControlClient:
 
     def envelope(self, receiver_beat: int, epoch: int = 0) -> Envelope:
         """Return the envelope of a new request."""
-        return Envelope(
-            protocol_version=PROTOCOL_VERSION, request_id=os.urandom(16).hex(), sender=self.sender,
-            epoch=epoch, receiver_beat=receiver_beat,
-        )  # fmt: skip
+        return new_envelope(self.sender, receiver_beat, epoch)
 
     def call(self, client: Any, request: Any, deadline: float, done: Callable[[Any], None]) -> Call:
         """Send a request.

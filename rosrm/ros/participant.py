@@ -25,7 +25,6 @@ from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.fast_dds import Pace, announcing_part, bound
 from rosrm.ros.network_interface import check_interface
 from rosrm.runtime.timer_slack import use_exact_timers
-from rosrm.version import PROTOCOL_VERSION
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -44,12 +43,10 @@ class OpenRequest:
 
     _send: Callable[[Any, Any], None]
     _header: Any
-    answered: bool = False
 
     def answer(self, response: Any) -> None:
         """Send the response."""
         self._send(response, self._header)
-        self.answered = True
 
 
 class Participant:
@@ -138,6 +135,10 @@ class Participant:
         self.guard.raise_interrupt()
         return self._executed != first
 
+    def post(self, callback: Callable[..., None], *arguments: Any) -> None:
+        """Call a callback in the loop, as that of a message; may be called from any thread."""
+        self.executor.create_task(self.counted(callback), *arguments)
+
     def wake(self) -> None:
         """End a waiting `spin`; may be called from any thread."""
         self.executor.create_task(_nothing)
@@ -178,17 +179,6 @@ class Participant:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def failed_response(service_type: Any, reason: str, code: str = "failed") -> Any:
-    """Return the response to a request whose handler raised, or that cannot be handled."""
-    response = service_type.Response()
-    answer = getattr(response, "answer", response)  # a handshake's response is itself the answer
-    answer.protocol_version, answer.accepted = PROTOCOL_VERSION, False
-    answer.message = f"an error of the receiver: {reason}" if code == "failed" else reason
-    if hasattr(answer, "code"):
-        answer.code = code
-    return response
 
 
 def _nothing() -> None:

@@ -4,18 +4,16 @@ Each message is in the body of a `rosrm_msgs/Sealed`. A message that does not op
 counted, without an answer. So a stranger learns nothing, and nothing is stored for it. If an answer
 does not open, its request stays open for the genuine answer. Messages of the master to all
 receivers are signed, in a `rosrm_msgs/Signed`, and not encrypted.
+
+rclpy is imported only with a participant: requests to a master on this machine need none.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Callable
-from typing import Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 from weakref import WeakKeyDictionary
-
-from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
-from rosidl_generator_py import import_type_support
 
 from rosrm.errors import Refused
 from rosrm.keys.links import SealedMessage
@@ -23,12 +21,23 @@ from rosrm.keys.roles import may_send
 from rosrm.keys.sealing import FORMAT, RUN_BYTES, channel_of
 from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
 from rosrm.keys.tickets import Ticket
-from rosrm.ros import cdr, qos, signed_codec
+from rosrm.ros import cdr, signed_codec
 from rosrm.ros.bounds import check_bounds
-from rosrm.ros.participant import OpenRequest, Participant, failed_response
-from rosrm.ros.sealed_codec import MOST_LETTERS, Envelope, decode, encode
-from rosrm.ros.sealed_topic import topic_channel, type_name
+from rosrm.ros.sealed_codec import (
+    MOST_LETTERS,
+    Envelope,
+    decode,
+    encode,
+    topic_channel,
+    type_name,
+)
+from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg, srv
+
+if TYPE_CHECKING:
+    from rclpy.qos import QoSProfile
+
+    from rosrm.ros.participant import OpenRequest, Participant
 
 #: Refusal of a request that was meant for another run of the receiver.
 _OTHER_RUN: Final = "the request is for another run of the receiver; nothing was done"
@@ -41,6 +50,9 @@ _OLD_TICKET: Final = (
 _MOST_RUNS: Final = 64
 #: Most bytes of the body of a sealed message.
 _LARGEST: Final = 1 << 24
+
+#: Called with an envelope, None for a malformed message, and the function that sends its answer.
+Take = Callable[[Envelope | None, Callable[[Envelope], None]], None]
 
 SecurityT = TypeVar("SecurityT", bound=Security)
 
@@ -107,27 +119,52 @@ def _plain(kind: Any, content: bytes) -> Any:
     return message
 
 
+class SealedCalls:
+    """Seals requests to one service, and opens their answers.
+
+    Args:
+        first_contact: store the run in each answer as the run of the server.
+    """
+
+    def __init__(self, service_type: Any, name: str, *, first_contact: bool) -> None:
+        self._first_contact = first_contact
+        self._response_type = service_type.Response
+        self._requests = request_channel(service_type, name)
+        self._answers = answer_channel(service_type, name)
+
+    def seal(self, peer: Peer, request: Any) -> Envelope:
+        """Return a request to `peer`."""
+        return sealed(peer, self._requests, request)
+
+    def open(self, peer: Peer, sent: Envelope, answer: Envelope | None) -> Any:
+        """Return the response of `peer` to a request; None: the answer is not genuine."""
+        reference = _sealed_part(sent).reference
+        content = answer and peer.link.open(self._answers, _sealed_part(answer), reference)
+        if answer is None or content is None:
+            return None
+        if self._first_contact:
+            peer.run = answer.run
+        return _plain(self._response_type, content)
+
+
 class SealedRequest:
     """A genuine request; `answer` may be called once, at any time.
 
     Attributes:
         peer: sender of the request.
         run: of the sender.
+        answered: True if the request was answered.
     """
 
     def __init__(
-        self, opened: OpenRequest, peer: Peer, channel: bytes, request: SealedMessage
+        self, send: Callable[[Envelope], None], peer: Peer, channel: bytes, request: SealedMessage
     ) -> None:
-        self._opened = opened
+        self._send = send
+        self.answered = False
         self._channel = channel
         self._request = request
         self.peer = peer
         self.run = request.run
-
-    @property
-    def answered(self) -> bool:
-        """Return True if the request was answered."""
-        return self._opened.answered
 
     def ticket_for(self, process: str) -> Ticket:
         """Return the sender's ticket for a process; raise `Refused` if it has none."""
@@ -141,8 +178,8 @@ class SealedRequest:
 
     def answer(self, response: Any) -> None:
         """Send the response."""
-        envelope = sealed(self.peer, self._channel, response, self._request)
-        self._opened.answer(cdr.made(srv.Sealed.Response, message=envelope_to_msg(envelope)))
+        self._send(sealed(self.peer, self._channel, response, self._request))
+        self.answered = True
 
 
 class SealedEndpoints(Generic[SecurityT]):
@@ -154,6 +191,7 @@ class SealedEndpoints(Generic[SecurityT]):
     Attributes:
         participant: owner of the entities.
         security: keys and peers of this master, slave or client.
+        takers: the receiver of the requests of each offered service, by its name.
         refuses_other_runs: if True, answer requests for other runs of the receiver with `stale`; if
             False, do not answer them.
     """
@@ -166,6 +204,7 @@ class SealedEndpoints(Generic[SecurityT]):
         self.security = security
         self.refused = refused
         self.refuses_other_runs = True
+        self.takers: dict[str, Take] = {}
         _load_service()
 
     def _open(
@@ -203,8 +242,7 @@ class SealedEndpoints(Generic[SecurityT]):
         service = name.rpartition("/")[2]
         guard = self.participant.guard
 
-        def take(request: srv.Sealed.Request, opened: OpenRequest) -> None:
-            envelope = envelope_from_msg(request.message)
+        def take(envelope: Envelope | None, send: Callable[[Envelope], None]) -> None:
             found = self._open(requests, name, envelope)
             if envelope is None or found is None:
                 return
@@ -212,7 +250,7 @@ class SealedEndpoints(Generic[SecurityT]):
             is_for_other_run = not first_contact and envelope.receiver_run != self.security.run
             if is_for_other_run and not self.refuses_other_runs:
                 return
-            genuine = SealedRequest(opened, peer, answers, _sealed_part(envelope))
+            genuine = SealedRequest(send, peer, answers, _sealed_part(envelope))
             refusal = _denial(peer, service)
             if refusal:
                 genuine.answer(failed_response(service_type, refusal, "denied"))
@@ -225,7 +263,14 @@ class SealedEndpoints(Generic[SecurityT]):
                 if fault and not genuine.answered:
                     genuine.answer(failed_response(service_type, fault))
 
-        self.participant.serve(srv.Sealed, name, take)
+        def take_message(request: srv.Sealed.Request, opened: OpenRequest) -> None:
+            def send(envelope: Envelope) -> None:
+                opened.answer(cdr.made(srv.Sealed.Response, message=envelope_to_msg(envelope)))
+
+            take(envelope_from_msg(request.message), send)
+
+        self.takers[name] = take
+        self.participant.serve(srv.Sealed, name, take_message)
 
     def client(
         self, service_type: Any, name: str, peer: Peer, *, first_contact: bool = False
@@ -235,9 +280,8 @@ class SealedEndpoints(Generic[SecurityT]):
         Args:
             first_contact: store the run in each answer as the run of `peer`.
         """
-        made = SealedClient(self.participant, service_type, name, peer, lambda: self.refused(name))
-        made.first_contact = first_contact
-        return made
+        calls = SealedCalls(service_type, name, first_contact=first_contact)
+        return SealedClient(self.participant, name, peer, calls, lambda: self.refused(name))
 
     # --- topics --------------------------------------------------------------------------
 
@@ -304,6 +348,8 @@ def _load_service() -> None:
     rclpy also loads the type of a service's introspection events, which rosrm does not use. An
     event contains an array of fixed length, for which the generated Python code imports numpy.
     """
+    from rosidl_generator_py import import_type_support  # noqa: PLC0415 - see the top
+
     event: Any = type(srv.Sealed.Event)
     if event._TYPE_SUPPORT is None:  # noqa: SLF001 - rclpy loads the type if it is None
         types = import_type_support("rosrm_msgs")
@@ -357,6 +403,8 @@ class SignedPublisher:
 
     def publish(self, message: Any) -> None:
         """Send a message."""
+        from rclpy.serialization import serialize_message  # noqa: PLC0415 - see the top
+
         self._counter += 1
         run, body = self._security.run, serialize_message(message)
         content = signed_codec.signed_content(self._channel, run, self._counter, body)
@@ -373,26 +421,25 @@ class SealedClient:
     """Client of a sealed service, with those methods of rclpy's client that rosrm uses.
 
     Args:
+        calls: seals the requests, and opens the answers.
         refused: called for each answer that does not open.
 
     Attributes:
         peer: the server; replaced when this client gets a new ticket.
-        first_contact: store the run in each answer as the run of the server.
     """
 
     def __init__(
-        self, participant: Participant, service_type: Any, name: str, peer: Peer,
+        self, participant: Participant, name: str, peer: Peer, calls: SealedCalls,
         refused: Callable[[], None],
     ) -> None:  # fmt: skip
+        from rosrm.ros import qos  # noqa: PLC0415 - see the top
+
         self._participant = participant
         self._name = name
         self.peer = peer
-        self.first_contact = False
+        self._calls = calls
         self._refused = refused
-        self._response_type = service_type.Response
-        self._requests = request_channel(service_type, name)
-        self._answers = answer_channel(service_type, name)
-        self._sent: WeakKeyDictionary[Any, tuple[Peer, SealedMessage]] = WeakKeyDictionary()
+        self._sent: WeakKeyDictionary[Any, tuple[Peer, Envelope]] = WeakKeyDictionary()
         self._client = participant.node.create_client(srv.Sealed, name, qos_profile=qos.SERVICE)
         self._pending_of = self._client.get_pending_request
         # The executor completes the future that this method returns with the first answer of its
@@ -404,10 +451,10 @@ class SealedClient:
 
     def call_async(self, request: Any) -> Any:
         """Send a request; return the future of its answer."""
-        envelope = sealed(self.peer, self._requests, request)
+        envelope = self._calls.seal(self.peer, request)
         message = envelope_to_msg(envelope)
         future = self._client.call_async(cdr.made(srv.Sealed.Request, message=message))
-        self._sent[future] = self.peer, _sealed_part(envelope)
+        self._sent[future] = self.peer, envelope
         return future
 
     def _answer_to(self, sequence: int) -> _Answer:
@@ -415,15 +462,11 @@ class SealedClient:
 
     def complete(self, future: Any, response: srv.Sealed.Response) -> None:
         """Complete a request by an answer, if the answer is genuine."""
-        envelope = envelope_from_msg(response.message)
-        peer, sent = self._sent[future]
-        plain = envelope and peer.link.open(self._answers, _sealed_part(envelope), sent.reference)
-        if envelope is None or plain is None:
+        answer = self._calls.open(*self._sent[future], envelope_from_msg(response.message))
+        if answer is None:
             self._refused()
-            return
-        if self.first_contact:
-            peer.run = envelope.run
-        future.set_result(_plain(self._response_type, plain))
+        else:
+            future.set_result(answer)
 
     def servers(self) -> int:
         """Return the number of discovered servers, also of those that were killed a moment ago."""
@@ -447,3 +490,14 @@ class _Answer:
     def set_result(self, response: srv.Sealed.Response) -> None:
         """Complete the request, if the answer is genuine."""
         self._client.guarded(self._client.complete, self._future, response)
+
+
+def failed_response(service_type: Any, reason: str, code: str = "failed") -> Any:
+    """Return the response to a request whose handler raised, or that cannot be handled."""
+    response = service_type.Response()
+    answer = getattr(response, "answer", response)  # a handshake's response is itself the answer
+    answer.protocol_version, answer.accepted = PROTOCOL_VERSION, False
+    answer.message = f"an error of the receiver: {reason}" if code == "failed" else reason
+    if hasattr(answer, "code"):
+        answer.code = code
+    return response

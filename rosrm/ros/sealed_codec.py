@@ -7,9 +7,9 @@ in which neither node of a handoff is active. A test compares this module with r
 from __future__ import annotations
 
 import struct
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from rosrm.keys.sealing import RUN_BYTES
+from rosrm.keys.sealing import RUN_BYTES, channel_of
 
 #: Encapsulation: little-endian plain CDR, no options.
 _HEADER: Final = b"\x00\x01\x00\x00"
@@ -33,6 +33,17 @@ class Envelope(NamedTuple):
     receiver_run: bytes
     counter: int
     body: bytes | memoryview
+
+
+def type_name(kind: Any, part: str = "") -> str:
+    """Return "rosrm_msgs/srv/Submit_Request" for the request type of `Submit`."""
+    package, folder = kind.__module__.split(".")[:2]
+    return f"{package}/{folder}/{kind.__name__}{part}"
+
+
+def topic_channel(message_type: Any, name: str) -> bytes:
+    """Return the channel of a topic."""
+    return channel_of(name, type_name(message_type))
 
 
 def encode(envelope: Envelope) -> bytes:

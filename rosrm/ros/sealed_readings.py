@@ -14,7 +14,7 @@ from rosrm.keys.links import OpenMessage
 from rosrm.keys.sealing import FORMAT, OVERHEAD
 from rosrm.keys.security import Peer
 from rosrm.ros.reading_codec import HOST_ID, READING_BYTES
-from rosrm.ros.sealed_topic import topic_channel
+from rosrm.ros.sealed_codec import topic_channel
 from rosrm_msgs import msg
 
 #: Encapsulation (little-endian plain CDR, no options), host, format, counter, length of the body.

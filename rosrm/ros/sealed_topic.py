@@ -9,23 +9,12 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message, serialize_message
 
 from rosrm.keys.links import Link, SealedMessage
-from rosrm.keys.sealing import FORMAT, RUN_BYTES, channel_of
-from rosrm.ros.sealed_codec import Envelope, decode, encode
+from rosrm.keys.sealing import FORMAT, RUN_BYTES
+from rosrm.ros.sealed_codec import Envelope, decode, encode, topic_channel
 from rosrm_msgs import msg
 
 #: Run of a receiver that is not known.
 UNKNOWN_RUN: Final = bytes(RUN_BYTES)
-
-
-def type_name(kind: Any, part: str = "") -> str:
-    """Return "rosrm_msgs/srv/Submit_Request" for the request type of `Submit`."""
-    package, folder = kind.__module__.split(".")[:2]
-    return f"{package}/{folder}/{kind.__name__}{part}"
-
-
-def topic_channel(message_type: Any, name: str) -> bytes:
-    """Return the channel of a topic."""
-    return channel_of(name, type_name(message_type))
 
 
 class SealedTopic:
