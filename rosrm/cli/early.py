@@ -1,12 +1,14 @@
 """DDS participant that is created before the command line is parsed.
 
-The discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and tables
+Not if the requests of the command can go through the socket of a master on this machine. The
+discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and tables
 take as long. Both run in parallel if the participant is created first.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from rosrm.model.ros_settings import RosSettings
@@ -22,6 +24,10 @@ ASKING: Final = frozenset({
     "status", "ps", "apps", "history", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip
+#: Those that also read the logs of slaves, or follow the load of the master, over DDS.
+_BEYOND_MASTER: Final = frozenset({"logs", "run", "top"})
+#: The sockets of this machine (of the network namespace), with a line for each.
+_SOCKETS: Final = Path("/proc/net/unix")
 #: Options with which a command joins ROS with other settings or not at all.
 _OTHERWISE: Final = ("-h", "--help", "--domain", "--cluster", "--local")
 
@@ -39,6 +45,11 @@ def join(arguments: Sequence[str], environment: Mapping[str, str]) -> None:
     if not _is_wanted(arguments, environment):
         return
     try:
+        socket, _ = RosSettings().socket_name()
+        if arguments[0] not in _BEYOND_MASTER and f" @{socket}" in _SOCKETS.read_text(
+            errors="replace"
+        ):
+            return
         from rosrm.ros.participant import Participant  # noqa: PLC0415 - the first import of ROS
 
         _made.append(Participant(RosSettings(), names.client_node()))

@@ -83,9 +83,15 @@ def connect(
         Refused: the master is of another version.
         RosrmError: ROS 2 cannot be imported.
     """
+    name = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
     try:
         # The first import of ROS.
         from rosrm.ros.master_connection import MasterClient  # noqa: PLC0415
+
+        return MasterClient.connect(
+            settings, name=name, timeout=timeout, security=security or security_mode(),
+            joined=joined, begun=begun,
+        )  # fmt: skip
     except ImportError as error:
         if (error.name or "").split(".")[0] == "rosrm":
             raise
@@ -94,11 +100,6 @@ def connect(
             f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
             "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
         ) from None
-    name = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
-    return MasterClient.connect(
-        settings, name=name, timeout=timeout, security=security or security_mode(), joined=joined,
-        begun=begun,
-    )  # fmt: skip
 
 
 def row_of(kind: str, name: str, rows: Mapping[str, Row]) -> Row:

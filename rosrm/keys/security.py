@@ -71,11 +71,13 @@ class Security(Protocol):
         run: random number of the run of this master, slave or client.
         described: text for users, for example "the key of host:robot-1".
         tickets_from: lowest version of the tickets that are in force.
+        cluster: identifier of the secret of the cluster, which discloses no key; b"": no secret.
     """
 
     run: bytes
     described: str
     tickets_from: int
+    cluster: bytes
 
     def peer(self, name: str, generation: int) -> Peer | None:
         """Return the peer with this name and key generation; None if no such key is valid."""
@@ -139,6 +141,7 @@ class MemberSecurity:
         self._key = key
         whom = str(key.grant.principal)
         self.described = f"the key of {whom}"
+        self.cluster = _identifier(key.master)
         link = KeyedLink(key.key, self.run, Direction.TO_MASTER, Direction.FROM_MASTER)
         grant = Grant(key.grant.principal, Role.MASTER, key.grant.generation)
         self.master = Peer(whom, key.grant.generation, link, grant)
@@ -240,6 +243,7 @@ class MasterSecurity:
         changed = self._peers and secret != self._secret
         self._secret = secret
         self._signing_key = bytes(secret.signing_key) + bytes(secret.signing_key.verify_key)
+        self.cluster = _identifier(self._signing_key[32:])
         self._principals = Principals(grants)
         self._peers = {
             known: peer for known, peer in self._peers.items()
@@ -352,6 +356,7 @@ class NoSecurity:
         self.run = run or new_run()
         self.tickets_from = 0
         self.described = "none"
+        self.cluster = b""
         self._link = OpenLink(self.run)
         self._peers: OrderedDict[tuple[str, int], Peer] = OrderedDict()
         name = "" if principal is None else str(principal)  # no message has the name ""
@@ -464,6 +469,11 @@ def _tag(content: bytes, master: bytes) -> bytes:
     forge the tag, but not the signature.
     """
     return digest_of(content, _TAG_BYTES, _TAG_PERSON, master)
+
+
+def _identifier(master: bytes) -> bytes:
+    """Return the identifier of a cluster from the master's public key, which strangers lack."""
+    return digest_of(master, 16, b"rosrm cluster")
 
 
 def _is_signed(content: bytes, signature: bytes, key: bytes) -> bool:

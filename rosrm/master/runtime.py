@@ -54,6 +54,7 @@ from rosrm.recording.reader import TABLES, Header
 from rosrm.ros.master.artifacts import ArtifactServices
 from rosrm.ros.master.diagnostics import open_diagnostics
 from rosrm.ros.master.endpoint import MasterEndpoint
+from rosrm.ros.master.request_socket import RequestSocket
 from rosrm.ros.master.search import ASK_EVERY, MasterSearch
 from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.participant import Participant
@@ -170,6 +171,7 @@ class MasterRuntime:
             opened.callback(self._end_record)
             self._begin_run(last, begun)
             search.end()
+            opened.enter_context(RequestSocket(self._endpoints))
             self._diagnostics = self._new_diagnostics()
             self._closing = opened.pop_all()
 

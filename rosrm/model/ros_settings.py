@@ -16,6 +16,12 @@ HIGHEST_DOMAIN: Final = 232
 NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 #: Environment variable with the network interface of rosrm's own participants.
 INTERFACE_VARIABLE: Final = "ROSRM_INTERFACE"
+#: Variables that can keep apart two participants of one machine and domain.
+_SEPARATING: Final = (
+    INTERFACE_VARIABLE, "ROS_DISCOVERY_SERVER", "FASTDDS_BUILTIN_TRANSPORTS", "RMW_IMPLEMENTATION",
+    "ROS_SECURITY_ENABLE", "ROS_SECURITY_KEYSTORE",
+    "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +107,16 @@ class RosSettings:
     def interface_in_force(self) -> str:
         """Return the interface of these settings or of ROSRM_INTERFACE; "": all interfaces."""
         return self._in_force().get(INTERFACE_VARIABLE, "")
+
+    def socket_name(self) -> tuple[str, str]:
+        """Return the parts of a name that two participants share only if they meet over ROS.
+
+        The first one holds the domain, the second one all else, also for participants that meet.
+        """
+        joined = self._in_force()
+        is_off = joined.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "OFF"
+        others = [self.namespace, is_off, *map(joined.get, _SEPARATING)]
+        return f"rosrm/{joined.get('ROS_DOMAIN_ID') or '0'}/", repr(others)
 
     def is_local(self) -> bool:
         """Return True if ROS traffic stays on this machine."""

@@ -1,4 +1,8 @@
-"""The connection to the master: requests and listings as ROS services; `rosrm.Client` uses it."""
+"""The connection to the master: requests and listings; `rosrm.Client` uses it.
+
+A request goes through the socket of a master on this machine, and otherwise, or if no answer comes,
+over DDS. rclpy is imported only for DDS.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +12,8 @@ import os
 import time
 from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm.errors import NoMaster, Refused
@@ -22,20 +27,21 @@ from rosrm.model.orders import CHECK_TIMEOUT
 from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import Listing, LogPart
 from rosrm.model.values import ProcessSpec
-from rosrm.ros import convert, names
+from rosrm.ros import convert, master_socket, names
 from rosrm.ros.bounds import check_bounds
-from rosrm.ros.control import ControlClient, check_answer
+from rosrm.ros.control import check_answer, new_envelope
 from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.ros.introductions import Introduction, introduction_of, introduction_request
-from rosrm.ros.load_reader import LoadReader
-from rosrm.ros.participant import Participant
-from rosrm.ros.sealed import SealedClient, SealedEndpoints
+from rosrm.ros.sealed import SealedCalls, SealedClient, SealedEndpoints
 from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of, positions_from_text
 from rosrm.version import PROTOCOL_VERSION, __version__
 from rosrm_msgs import srv
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from rosrm.ros.load_reader import LoadReader
+    from rosrm.ros.participant import Participant
 
 #: Seconds between two checks for a service's discovery, for which rclpy has no event.
 _LOOK: Final = 0.005
@@ -65,11 +71,15 @@ def _spin(participant: Participant, timeout: float) -> None:
         participant.spin(timeout)
 
 
-def wait_for_service(participant: Participant, client: Any, deadline: float) -> bool:
+def wait_for_service(
+    participant: Participant, client: Any, deadline: float,
+    on_look: Callable[[], None] = lambda: None,
+) -> bool:  # fmt: skip
     """Return True if a service is discovered before `deadline` (monotonic seconds)."""
     while not client.service_is_ready():
         if time.monotonic() >= deadline:
             return False
+        on_look()
         _spin(participant, _LOOK)
     return True
 
@@ -91,13 +101,19 @@ def wait_until(
 
 @dataclass(slots=True)
 class _Answers:
-    """The first answer to a request, and the number of times that the request was sent."""
+    """The first answer to a request, and when and how many times the request was sent."""
 
+    on_wait: OnWait | None = None
     first: tuple[Any, ...] = ()
     sent: int = 0
+    began: float = field(default_factory=time.monotonic)
 
     def take(self, future: Any) -> None:
         self.first = self.first or (future.result(),)
+
+    def wait(self) -> None:
+        if self.on_wait is not None:
+            self.on_wait(time.monotonic() - self.began)
 
     @property
     def answer(self) -> Any:
@@ -123,61 +139,25 @@ def is_unsure(answer: Any, epoch: int) -> bool:
     return answer.code == "stale" or answer.epoch not in (_UNKNOWN_EPOCH, epoch)
 
 
-Endpoints = SealedEndpoints[Member]
-
-
-def find_master(endpoints: Endpoints, who: str, timeout: float) -> srv.Handshake.Response | None:
-    """Find a master and shake hands; return its description of itself, None: no answer in time.
-
-    `who` is the role and name of the caller.
-    """
-    deadline = time.monotonic() + timeout
-    participant, master = endpoints.participant, endpoints.security.master
-    path = names.Names(participant.settings.namespace)(names.HANDSHAKE)
-    client = endpoints.client(srv.Handshake, path, master, first_contact=True)
-    try:
-        if not wait_for_service(participant, client, deadline):
-            return None
-        return _shake_hands(participant, client, who, deadline)
-    finally:
-        client.destroy()
-
-
-def _shake_hands(
-    participant: Participant, client: SealedClient, who: str, deadline: float
-) -> srv.Handshake.Response | None:
-    """Return the master's description of itself; None: no answer before the deadline.
-
-    The handshake is repeated when DDS discovers another server, because the services of a killed
-    master look ready until its DDS lease ends.
-    """
-    role, _, name = who.partition(" ")
-    request = srv.Handshake.Request(
-        protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
-    )
-    return _ask_until_answered(
-        participant, client, request, deadline, _GREET_AGAIN, servers=client.servers, look=_LOOK
-    ).answer
-
-
 def _ask_until_answered(
     participant: Participant, client: Any, request: Any, deadline: float, again: float,
-    on_wait: OnWait | None = None, *, servers: Callable[[], int] = int, look: float = 0.1,
+    *, servers: Callable[[], int] = int, look: float = 0.1, answers: _Answers | None = None,
 ) -> _Answers:  # fmt: skip
     """Repeat a request until `deadline`; return the first answer.
 
-    `on_wait` is called about every `look` seconds with the seconds since the first request.
     `servers` returns the number of discovered servers; another number repeats the request at once.
+    `look`: seconds between two calls of `answers.wait`. `answers`: those of a request that may have
+    been sent in another way before.
 
     A server sends no answer before it has discovered the client's reader, and a new client's
     request may arrive earlier.
     """
-    answers, began = _Answers(), time.monotonic()
+    answers = answers or _Answers()
     known = 0
 
     def ended() -> bool:
-        if not answers.first and on_wait is not None:
-            on_wait(time.monotonic() - began)
+        if not answers.first:
+            answers.wait()
         return bool(answers.first) or servers() != known
 
     while not answers.first:
@@ -192,31 +172,14 @@ def _ask_until_answered(
     return answers
 
 
-def _about_security(endpoints: Endpoints) -> tuple[str, str]:
+def _about_security(security: str) -> tuple[str, str]:
     """Return the security of this side, and how to check that the master has the same."""
-    security = endpoints.security.described
     if security == "none":
         return "security: none", "A master with `security: keys` answers only clients with a key"
     return security, (
         "`rosrm key check` shows this user's keys, and `rosrm key list` on the machine of the "
         "master the valid ones"
     )
-
-
-def _greet(endpoints: Endpoints, name: str, timeout: float, begun: float) -> srv.Handshake.Response:
-    """Return the master's greeting; raises `NoMaster` or `Refused`."""
-    hello = find_master(endpoints, f"client {name}", timeout)
-    settings = endpoints.participant.settings
-    if hello is None:
-        security, advice = _about_security(endpoints)
-        raise NoMaster(
-            f"no master answered within {time.monotonic() - begun:.1f} s ({settings.describe()}, "
-            f"namespace {settings.namespace}, {security}). "
-            f"{_to_check(settings)} {advice}"
-        )
-    if not hello.accepted:
-        raise Refused(hello.message, "version")
-    return hello
 
 
 def _to_check(settings: RosSettings) -> str:
@@ -236,15 +199,19 @@ class MasterClient:
     """
 
     def __init__(
-        self, endpoints: Endpoints, hello: srv.Handshake.Response, name: str, timeout: float
-    ) -> None:
-        self._endpoints = endpoints
-        self._participant = participant = endpoints.participant
-        self._master = hello
-        self._last_contact = time.monotonic()
+        self, settings: RosSettings, security: Member, name: str, timeout: float,
+        joined: Participant | None,
+    ) -> None:  # fmt: skip
+        self._settings = settings
+        self._security = security
+        self._socket = master_socket.address(settings, security)
+        self._joined = joined
+        self._made_endpoints: SealedEndpoints[Member] | None = None
+        self._master = srv.Handshake.Response()
+        self._last_contact = -math.inf
         self._timeout = timeout
-        self._names = names.Names(participant.settings.namespace)
-        self._control = ControlClient(participant, f"client {name}")
+        self._names = names.Names(settings.namespace)
+        self._sender = f"client {name}"
         self._clients: dict[str, SealedClient] = {}
         self._log_clients: dict[str, SealedClient] = {}
         self._introductions: dict[tuple[str, str], Introduction] = {}
@@ -261,7 +228,7 @@ class MasterClient:
         Args:
             settings: for joining ROS.
             name: of this client, for the master's messages.
-            timeout: seconds for discovery; a request has the same time, at least 10 s.
+            timeout: seconds for finding the master; a request has the same time, at least 10 s.
             security: "keys" or "none", as the master's.
             joined: an existing participant, which the client then owns.
             begun: start of the user's wait (monotonic seconds), for the message; None: now.
@@ -272,14 +239,61 @@ class MasterClient:
             Refused: the master has another version.
         """
         begun = time.monotonic() if begun is None else begun
-        participant = joined or Participant(settings, names.client_node())
+        settings.check()
         try:
-            endpoints = SealedEndpoints(participant, user_security(security, timeout))
-            hello = _greet(endpoints, name, timeout, begun)
+            member = user_security(security, timeout)
         except BaseException:  # also an interrupt must leave no open participant
-            participant.close()
+            if joined is not None:
+                joined.close()
             raise
-        return cls(endpoints, hello, name, max(timeout, _REQUEST))
+        client = cls(settings, member, name, max(timeout, _REQUEST), joined)
+        try:
+            client._greet(timeout, begun)
+        except BaseException:
+            client.close()
+            raise
+        return client
+
+    def _greet(self, timeout: float, begun: float) -> None:
+        """Find the master; raise `NoMaster` or `Refused`."""
+        hello = self._shake_hands(time.monotonic() + timeout)
+        settings = self._settings
+        if hello is None:
+            security, advice = _about_security(self._security.described)
+            raise NoMaster(
+                f"no master answered within {time.monotonic() - begun:.1f} s "
+                f"({settings.describe()}, namespace {settings.namespace}, {security}). "
+                f"{_to_check(settings)} {advice}"
+            )
+        if not hello.accepted:
+            raise Refused(hello.message, "version")
+
+    def _shake_hands(self, deadline: float) -> srv.Handshake.Response | None:
+        """Return the master's description of itself; None: no answer before the deadline."""
+        role, _, name = self._sender.partition(" ")
+        request = srv.Handshake.Request(
+            protocol_version=PROTOCOL_VERSION, software_version=__version__, role=role, name=name
+        )
+        hello = self._ask_master(
+            srv.Handshake, names.HANDSHAKE, request, deadline, _GREET_AGAIN
+        ).answer
+        if hello is not None:
+            self._master, self._last_contact = hello, time.monotonic()
+        return hello
+
+    @property
+    def _endpoints(self) -> SealedEndpoints[Member]:
+        """Endpoints over DDS, created on first use, because that imports rclpy."""
+        if self._made_endpoints is None:
+            from rosrm.ros.participant import Participant  # noqa: PLC0415 - see above
+
+            self._joined = self._joined or Participant(self._settings, names.client_node())
+            self._made_endpoints = SealedEndpoints(self._joined, self._security)
+        return self._made_endpoints
+
+    @property
+    def _participant(self) -> Participant:
+        return self._endpoints.participant
 
     @property
     def master_pid(self) -> int:
@@ -347,13 +361,17 @@ class MasterClient:
     def load(self) -> Mapping[str, float]:
         """Return figures of the master's newest load; the first call begins to follow them."""
         if self._load is None:
+            from rosrm.ros.load_reader import LoadReader  # noqa: PLC0415 - imports rclpy
+
             self._load = LoadReader(self._endpoints, self._names(names.MASTER_LOAD))
         return self._load.newest
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""
-        _spin(self._participant, timeout)
-        self._control.expire(time.monotonic())
+        if self._joined is None:
+            time.sleep(timeout)  # nothing arrives without a request
+        else:
+            _spin(self._joined, timeout)
 
     def cancel(self, processes: Sequence[str]) -> str:
         """Remove processes from the queue, or stop them."""
@@ -459,15 +477,10 @@ class MasterClient:
 
     def _envelope(self) -> Any:
         """Return a request's envelope; renew the beat before the master would reject it as old."""
-        if time.monotonic() - self._last_contact > 1.0:
-            # The client is kept: DDS takes up to 0.1 s to discover a new one.
-            client = self._client(srv.Handshake, names.HANDSHAKE)
-            deadline = time.monotonic() + self._timeout
-            hello = _shake_hands(self._participant, client, self._control.sender, deadline)
-            if hello is None:
-                raise self._silent(_MASTER)
-            self._master, self._last_contact = hello, time.monotonic()
-        return self._control.envelope(self._master.beat, self._master.epoch)
+        now = time.monotonic()
+        if now - self._last_contact > 1.0 and self._shake_hands(now + self._timeout) is None:
+            raise self._silent(_MASTER)
+        return new_envelope(self._sender, self._master.beat, self._master.epoch)
 
     def _ask(self, kind: Any, name: str, *, patience: float = 0.0, **fields: Any) -> str:
         """Send a request that acts, and return the master's message; see `_request`."""
@@ -496,36 +509,76 @@ class MasterClient:
             trouble: its reason, if that is known.
             unknown: a sentence on the fate of the request.
         """
-        settings = self._participant.settings
+        settings = self._settings
         check = _to_check(settings) if who == _MASTER else "Is `rosrm slave` running there?"
         return NoMaster(
             f"{who} did not answer within {self._timeout:g} s ({settings.describe()})"
             f"{trouble}{unknown}{'' if trouble else f'. {check}'}"
         )
 
-    def _client(self, kind: Any, name: str) -> SealedClient:
-        """Return a client of a service of the master."""
-        path = self._names(name)
-        client = self._clients.get(path)
-        if client is None:
-            master = self._endpoints.security.master
-            client = self._endpoints.client(kind, path, master, first_contact=True)
-            self._clients[path] = client
-            self._discover(client, _MASTER)
-        return client
+    def _ask_master(
+        self, kind: Any, name: str, request: Any, deadline: float, again: float,
+        on_wait: OnWait | None = None,
+    ) -> _Answers:  # fmt: skip
+        """Send a request through the socket of the master, then over DDS until it is answered."""
+        answers = _Answers(on_wait)
+        until = min(deadline, answers.began + again)
+        self._ask_socket(kind, self._names(name), request, until, answers)
+        if answers.first:
+            return answers
+        client = self._client(kind, name)
+        # The services of a killed master look ready until its DDS lease ends, so a handshake is
+        # repeated when DDS discovers another server.
+        more: Any = {"servers": client.servers, "look": _LOOK} if kind is srv.Handshake else {}
+        if wait_for_service(self._participant, client, deadline, answers.wait):
+            _ask_until_answered(
+                self._participant, client, request, deadline, again, answers=answers, **more
+            )
+        return answers
 
-    def _discover(self, client: SealedClient, who: str) -> None:
-        if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
-            raise self._silent(who)
+    def _ask_socket(
+        self, kind: Any, service: str, request: Any, until: float, answers: _Answers
+    ) -> None:
+        """Send a request through the socket of the master, if there is one."""
+        connection = master_socket.connect(self._socket)
+        if connection is None:
+            return
+        with connection:
+            master = self._security.master
+            calls = SealedCalls(kind, service, first_contact=True)
+            sent = calls.seal(master, request)
+            content = master_socket.request_of(service, sent)
+            if len(content) > master_socket.MOST_REQUEST:
+                return
+            answers.sent = 1
+            answer = master_socket.ask(connection, content, until, answers.on_wait)
+        response = calls.open(master, sent, answer)
+        if response is None:
+            self._socket = ""  # DDS from now on, so that no other request waits in vain
+        else:
+            answers.first = (response,)
+        if self._load is not None:
+            _spin(self._participant, 0.0)  # takes the load that has arrived
+
+    def _client(self, kind: Any, name: str) -> SealedClient:
+        """Return a client of a service of the master over DDS, which takes 0.1 s to discover it."""
+        path = self._names(name)
+        if path not in self._clients:
+            self._clients[path] = self._endpoints.client(
+                kind, path, self._security.master, first_contact=True
+            )
+        return self._clients[path]
 
     def _call_slave(self, host: str, process: str, request: srv.ReadLog.Request) -> Any:
         """Send a request for a log to a slave, with a ticket."""
         who = f"the slave of {host}"
         for is_repeated in (False, True):
             client = self._introduced(host, process)
-            self._discover(client, who)
+            if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
+                raise self._silent(who)
+            ask = partial(_ask_until_answered, self._participant, client, request, again=_AGAIN)
             try:
-                return self._answered(client, srv.ReadLog, request, who)
+                return self._answered(ask, srv.ReadLog, request, who)
             except Refused as refusal:
                 if is_repeated or refusal.code != "stale":
                     raise
@@ -558,37 +611,41 @@ class MasterClient:
             if refusal.code != "silent":
                 raise
             raise NoMaster(f"{refusal}. Is `rosrm slave` running there?") from refusal
-        return introduction_of(response, self._endpoints.security, now)
+        return introduction_of(response, self._security, now)
 
     def _call(
         self, kind: Any, name: str, request: Any, patience: float = 0.0,
         on_wait: OnWait | None = None,
     ) -> Any:  # fmt: skip
         """Send a request to the master until it is answered."""
-        client = self._client(kind, name)
+        ask = partial(self._ask_master, kind, name, request, again=_AGAIN, on_wait=on_wait)
         try:
-            return self._answered(client, kind, request, _MASTER, patience, on_wait)
+            return self._answered(ask, kind, request, _MASTER, patience)
         except Refused as refusal:
             if refusal.code != "stale" or hasattr(request, "envelope"):
                 raise
             # Another run of the master answered, and its run is stored now. A read-only request may
             # be repeated.
-            return self._answered(client, kind, request, _MASTER)
+            return self._answered(ask, kind, request, _MASTER)
 
     def _answered(
-        self, client: SealedClient, kind: Any, request: Any, who: str, patience: float = 0.0,
-        on_wait: OnWait | None = None,
+        self, ask: Callable[..., _Answers], kind: Any, request: Any, who: str,
+        patience: float = 0.0,
     ) -> Any:  # fmt: skip
         """Send a request until an answer comes; the receiver repeats a lost answer.
+
+        `ask` sends it until the deadline that it is given.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
         One that exceeds its bounds is not sent: `Refused` names the field.
         """
         check_bounds(request)
         deadline = time.monotonic() + max(self._timeout, patience)
-        answers = _ask_until_answered(self._participant, client, request, deadline, _AGAIN, on_wait)
+        answers = ask(deadline=deadline)
         response = answers.answer
         acts = hasattr(request, "envelope")  # read-only requests have none
+        if response is None and not answers.sent:
+            raise self._silent(who)
         if response is None:
             unknown = ". It is not known whether it was done" if acts else ""
             raise self._silent(who, self._trouble(kind), unknown)
@@ -606,15 +663,15 @@ class MasterClient:
         if kind is srv.List:
             return ""
         request = srv.List.Request(protocol_version=PROTOCOL_VERSION)
-        client, deadline = self._client(srv.List, names.LIST), time.monotonic() + _AGAIN
-        answers = _ask_until_answered(self._participant, client, request, deadline, _GREET_AGAIN)
-        answer = answers.answer
+        deadline = time.monotonic() + _AGAIN
+        answer = self._ask_master(srv.List, names.LIST, request, deadline, _GREET_AGAIN).answer
         trouble = answer.trouble if answer is not None else ""
         return f": {trouble}. The request may still be executed then" if trouble else ""
 
     def close(self) -> None:
         """Leave ROS."""
-        self._participant.close()
+        if self._joined is not None:
+            self._joined.close()
 
     def __enter__(self) -> Self:
         return self

@@ -20,7 +20,7 @@ from rosrm.keys.cluster import own_grant
 from rosrm.keys.roles import Role, principal_of
 from rosrm.keys.security import NoSecurity
 from rosrm.keys.tickets import Ticket
-from rosrm.ros import names, qos
+from rosrm.ros import master_socket, names, qos
 from rosrm.ros.sealed_readings import reading_channel, seal_reading
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs import msg
@@ -238,8 +238,9 @@ def test_the_status_shows_strangers(scene, intruder) -> None:
 # --- what was overheard -------------------------------------------------------------------------
 
 
-def test_second_servers_neither_learn_nor_answer(scene, intruder) -> None:
+def test_second_servers_neither_learn_nor_answer(scene, intruder, monkeypatch) -> None:
     """The answers of the intruder come first; the requests reach the true servers, unread."""
+    monkeypatch.setattr(master_socket, "connect", lambda _: None)  # all requests over DDS
     intruder.overhear()
     cluster = scene.cluster
 

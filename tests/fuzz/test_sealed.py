@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from rosrm.keys.cluster import ClusterSecret
 from rosrm.keys.security import MasterSecurity, MemberSecurity
 from rosrm.keys.tickets import ticket_of
+from rosrm.ros.master_socket import request_of, service_and_envelope
 from rosrm.ros.reading_codec import Reading
 from rosrm.ros.reading_codec import encode as encode_reading
 from rosrm.ros.sealed_codec import Envelope, decode, encode
@@ -27,6 +28,15 @@ def test_an_envelope_is_read_or_nothing(data: bytes) -> None:
     if envelope is not None:
         assert (len(envelope.run), len(envelope.receiver_run)) == (16, 16)
         assert len(envelope.body) <= len(data)
+
+
+@fuzzed(300)
+@given(data=damaged_bytes(request_of("/rosrm/list", decode(ENVELOPE))) | st.binary(max_size=200))
+def test_a_request_of_the_socket_is_read_or_nothing(data: bytes) -> None:
+    """The service is a text, and the envelope has all its fields in the bytes that came."""
+    service, envelope = service_and_envelope(data)
+    assert len(service) <= len(data)
+    assert envelope is None or len(envelope.run) == len(envelope.receiver_run) == 16
 
 
 def _reading(host: int) -> bytes:

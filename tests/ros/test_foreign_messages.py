@@ -12,7 +12,7 @@ import pytest
 
 from rosrm.config.settings import ControlSettings
 from rosrm.errors import NoMaster
-from rosrm.keys.finding import master_security, user_security
+from rosrm.keys.finding import master_security
 from rosrm.keys.security import Authority
 from rosrm.keys.tickets import ticket_of
 from rosrm.model.values import (
@@ -24,7 +24,7 @@ from rosrm.model.values import (
 from rosrm.ros import convert, names, qos
 from rosrm.ros.control import ControlClient
 from rosrm.ros.introductions import introduction_of, introduction_request
-from rosrm.ros.master_connection import MasterClient, find_master, wait_for_service
+from rosrm.ros.master_connection import MasterClient, wait_for_service
 from rosrm.ros.participant import Participant
 from rosrm.ros.reading_codec import Reading, encode
 from rosrm.ros.sealed import SealedEndpoints
@@ -553,9 +553,8 @@ def test_a_ticket_needs_the_clock_of_its_slave(cluster, played, user) -> None:
 def test_clusters_of_different_namespaces_do_not_meet(cluster) -> None:
     """Two masters may share a domain in different namespaces."""
     settings = replace(cluster.ros, namespace="/elsewhere")
-    with Participant(settings, "rosrm_test_elsewhere") as participant:
-        endpoints = SealedEndpoints(participant, user_security("keys"))
-        assert find_master(endpoints, "client test", 1.0) is None
+    with pytest.raises(NoMaster):
+        MasterClient.connect(settings, name="test", timeout=1.0)
 
 
 def test_a_request_to_an_absent_slave_fails(cluster) -> None:

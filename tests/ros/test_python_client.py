@@ -10,6 +10,7 @@ import pytest
 
 from rosrm import Client, NoMaster
 from rosrm.keys.key_files import key_home, make_secret
+from rosrm.ros import master_socket
 from rosrm.ros.master_connection import MasterClient
 from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import claim_domain
@@ -46,9 +47,10 @@ def test_a_client_without_a_master_says_so_within_its_time_out():
         quickest(connect, 2.5)
 
 
-def test_a_client_repeats_the_handshake_with_the_same_ros_client(make_cluster):
+def test_a_client_repeats_the_handshake_with_the_same_ros_client(make_cluster, monkeypatch):
     """Otherwise DDS would take up to 0.1 s to discover a new ROS client for the handshake."""
     cluster = make_cluster(host("h0"))
+    monkeypatch.setattr(master_socket, "connect", lambda _: None)
     with MasterClient.connect(cluster.ros, name="other", timeout=PATIENCE) as client:
         services = []
         for number in range(3):

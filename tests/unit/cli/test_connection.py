@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -87,6 +88,7 @@ def joined(monkeypatch):
         def close(self):
             became.append("closed")
 
+    monkeypatch.setattr(early, "_SOCKETS", Path(os.devnull))
     module = SimpleNamespace(Participant=Participant)
     monkeypatch.setitem(sys.modules, "rosrm.ros.participant", module)
     yield became
@@ -110,6 +112,20 @@ def joined(monkeypatch):
 def test_ros_is_joined_early_only_where_it_is_sure_how(joined, line, environment, joins):
     """An option or a file may change the join, or make it unnecessary."""
     early.join(line, environment)
+    assert joined == ["made"] * joins
+
+
+@pytest.mark.parametrize(("domain", "command", "joins"), [(3, "ps", False), (3, "logs", True),
+                                                       (30, "ps", True)])  # fmt: skip
+def test_ros_is_not_joined_early_where_the_master_has_a_socket(
+    joined, monkeypatch, tmp_path, domain, command, joins
+):
+    """Logs are read from slaves over DDS."""
+    sockets = tmp_path / "unix"
+    sockets.write_text("Num  Path\n0000: 00000002 0 00010000 0001 01 17 @rosrm/3/0f0f\n")
+    monkeypatch.setattr(early, "_SOCKETS", sockets)
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+    early.join([command], {})
     assert joined == ["made"] * joins
 
 
@@ -140,7 +156,10 @@ def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, serve
     closed = []
     participant = SimpleNamespace(settings=settings, close=lambda: closed.append(True))
     monkeypatch.delenv("ROS_DISCOVERY_SERVER", raising=False)
-    monkeypatch.setattr(master_connection, "find_master", lambda *_: None)
+    monkeypatch.setattr(master_connection.MasterClient, "_client", lambda *_: None)
+    monkeypatch.setattr(master_connection, "wait_for_service", lambda *_: False)
+    endpoints = SimpleNamespace(participant=participant)  # without the import of ROS
+    monkeypatch.setattr(master_connection, "SealedEndpoints", lambda *_: endpoints)
     monkeypatch.setattr(master_connection, "user_security", lambda *_: NoSecurity())
     with pytest.raises(NoMaster) as refusal:
         master_connection.MasterClient.connect(

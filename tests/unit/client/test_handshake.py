@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 from rosrm.ros import master_connection
-from rosrm.ros.master_connection import _shake_hands
+from rosrm.ros.master_connection import _LOOK, _ask_until_answered
 
 GREETING = object()
 
@@ -42,6 +42,9 @@ def test_a_newly_discovered_server_gets_the_handshake_at_once(monkeypatch) -> No
     """The service of a killed master looks ready, and the interval of repetitions is 0.5 s."""
     network = Network()
     monkeypatch.setattr(master_connection, "time", network)
-    assert _shake_hands(network, network, "client test", 10.0) is GREETING
+    found = _ask_until_answered(
+        network, network, object(), 10.0, 0.5, servers=network.servers, look=_LOOK
+    )
+    assert found.answer is GREETING
     assert len(network.sent) == 2
     assert network.sent[1] < network.found_at + 0.02
