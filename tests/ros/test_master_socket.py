@@ -101,7 +101,7 @@ def test_a_command_on_the_machine_of_the_master_needs_no_dds(make_cluster) -> No
 
 def test_an_impostor_on_the_socket_only_costs_time(make_cluster) -> None:
     """A program that has bound the name before the master cannot answer; DDS remains."""
-    cluster = make_cluster()
+    cluster = make_cluster(started=False)
     cluster.is_attacked = True
     with socket.socket(socket.AF_UNIX) as impostor:
         impostor.bind(master_socket.address(cluster.ros, master_security("keys")))
