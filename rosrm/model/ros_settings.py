@@ -18,7 +18,7 @@ NAMESPACE: Final = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 INTERFACE_VARIABLE: Final = "ROSRM_INTERFACE"
 #: Variables that can keep apart two participants of one machine and domain.
 _SEPARATING: Final = (
-    INTERFACE_VARIABLE, "ROS_DISCOVERY_SERVER", "FASTDDS_BUILTIN_TRANSPORTS", "RMW_IMPLEMENTATION",
+    INTERFACE_VARIABLE, "ROS_DISCOVERY_SERVER", "FASTDDS_BUILTIN_TRANSPORTS",
     "ROS_SECURITY_ENABLE", "ROS_SECURITY_KEYSTORE",
     "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE",
 )  # fmt: skip
@@ -96,7 +96,7 @@ class RosSettings:
             conflict = "ROS_LOCALHOST_ONLY=1"
         elif joined.get("FASTDDS_BUILTIN_TRANSPORTS", "") not in ("", "UDPv4"):
             conflict = "transports other than UDPv4 (or FASTDDS_BUILTIN_TRANSPORTS)"
-        elif "fastrtps" not in (joined.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"):
+        elif "fastrtps" not in (_rmw_of(joined)):
             conflict = f"RMW_IMPLEMENTATION={joined['RMW_IMPLEMENTATION']}"
         if interface and conflict:
             raise ConfigError(
@@ -115,7 +115,9 @@ class RosSettings:
         """
         joined = self._in_force()
         is_off = joined.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "OFF"
-        others = [self.namespace, is_off, *map(joined.get, _SEPARATING)]
+        alone = is_off and os.getpid()  # meets no other participant
+        variables = (joined.get(name) or "" for name in _SEPARATING)
+        others = [self.namespace, alone, _rmw_of(joined), *variables]
         return f"rosrm/{joined.get('ROS_DOMAIN_ID') or '0'}/", repr(others)
 
     def is_local(self) -> bool:
@@ -136,6 +138,10 @@ class RosSettings:
         interface = self.interface_in_force()
         return (
             f"domain {joined.get('ROS_DOMAIN_ID', '0')}, "
-            f"RMW {joined.get('RMW_IMPLEMENTATION', 'rmw_fastrtps_cpp')}, "
+            f"RMW {_rmw_of(joined)}, "
             f"discovery {discovery}" + (f", interface {interface}" if interface else "")
         )
+
+
+def _rmw_of(joined: Mapping[str, str]) -> str:
+    return joined.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"

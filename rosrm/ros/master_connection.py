@@ -522,19 +522,19 @@ class MasterClient:
     ) -> _Answers:  # fmt: skip
         """Send a request through the socket of the master, then over DDS until it is answered."""
         answers = _Answers(on_wait)
-        until = min(deadline, answers.began + again)
+        until = answers.began + min(again, (deadline - answers.began) / 2)  # the rest is for DDS
         self._ask_socket(kind, self._names(name), request, until, answers)
         if answers.first:
             return answers
         client = self._client(kind, name)
+        if not wait_for_service(self._participant, client, deadline, answers.wait):
+            return answers
         # The services of a killed master look ready until its DDS lease ends, so a handshake is
         # repeated when DDS discovers another server.
         more: Any = {"servers": client.servers, "look": _LOOK} if kind is srv.Handshake else {}
-        if wait_for_service(self._participant, client, deadline, answers.wait):
-            _ask_until_answered(
-                self._participant, client, request, deadline, again, answers=answers, **more
-            )
-        return answers
+        return _ask_until_answered(
+            self._participant, client, request, deadline, again, answers=answers, **more
+        )
 
     def _ask_socket(
         self, kind: Any, service: str, request: Any, until: float, answers: _Answers

@@ -70,6 +70,10 @@ def test_nothing_notices_a_gateway_that_is_killed_20_times(make_cluster, monkeyp
         made.wait(name, "running")
     shorten_lease(monkeypatch, tmp_path)
     graph = made.client._participant.node.get_node_names
+    parts = {"rosrm_master", "rosrm_slave_robot_1", "rosrm_slave_robot_2"}
+    wait_until(
+        lambda: parts <= set(graph()), "all parts in the graph", seen=graph, pause=made.client.spin
+    )
     others, master = sorted(graph()), psutil.Process(made.master.process.pid)
     before, sizes = made.client.list().last_sequence, []
     for number in range(KILLS):

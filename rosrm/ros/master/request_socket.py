@@ -57,8 +57,13 @@ class RequestSocket:
             except OSError:  # the listener is closed, or this process has too many open files
                 self._closed.wait(_TRANSFER)
                 continue
-            with connection, contextlib.suppress(OSError, queue.Empty):
-                self._serve(connection)
+            with connection:
+                try:
+                    self._serve(connection)
+                except (OSError, queue.Empty):  # the client uses DDS instead
+                    continue
+                except Exception:  # noqa: BLE001 - a fault in one request must end no thread
+                    _log.exception("a request on the socket of this machine has failed")
 
     def _serve(self, connection: socket.socket) -> None:
         until = time.monotonic() + _TRANSFER

@@ -131,15 +131,30 @@ def test_a_client_that_does_not_read_holds_up_no_other(side: Side) -> None:
         assert side.ask() == ENVELOPE
 
 
-def test_a_request_without_an_answer_ends_at_its_time(side: Side) -> None:
+def test_a_request_without_an_answer_ends_at_its_time(side: Side, monkeypatch) -> None:
     """The caller is told how long it has waited so far."""
-    side.endpoints.takers[SERVICE] = lambda *_: None
+    monkeypatch.setattr(request_socket, "_DECISION", PATIENCE)
+    late = []
+    side.endpoints.takers[SERVICE] = lambda _, send: late.append(send)
     waits: list[float] = []
     with side.connect() as connection:
         request = master_socket.request_of(SERVICE, ENVELOPE)
-        until = time.monotonic() + PATIENCE
+        until = time.monotonic() + 0.35
         assert master_socket.ask(connection, request, until, waits.append) is None
+        assert time.monotonic() >= until
+    late.pop()(ENVELOPE)  # ends the wait of the thread
+    assert waits
     assert waits == sorted(waits)
+
+
+def test_a_fault_ends_no_thread(side: Side, caplog) -> None:
+    """Otherwise each fault would leave one thread less for other requests."""
+    works, side.endpoints.participant.post = side.endpoints.participant.post, lambda *_: 1 / 0
+    for _ in range(request_socket._THREADS):
+        assert side.ask() is None
+    side.endpoints.participant.post = works
+    assert side.ask() == ENVELOPE
+    assert "a request on the socket of this machine has failed" in caplog.text
 
 
 def test_a_name_in_use_is_left_to_its_owner(side: Side, caplog) -> None:
@@ -186,4 +201,6 @@ def test_master_and_user_of_a_cluster_have_the_same_address(monkeypatch) -> None
     assert len(addresses | {found, master_socket.address(SETTINGS, foreign)}) == len(others) + 2
     monkeypatch.setenv("ROS_DOMAIN_ID", "7")
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")  # as without the variable
+    monkeypatch.setenv("ROS_DISCOVERY_SERVER", "")
     assert found == master_socket.address(RosSettings(), MemberSecurity(key))
