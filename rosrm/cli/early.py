@@ -1,8 +1,8 @@
 """DDS participant that is created before the command line is parsed.
 
-Not if the requests of the command can go through the socket of a master on this machine. The
-discovery of the master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and tables
-take as long. Both run in parallel if the participant is created first.
+A command that can use the socket of a master on this machine creates none. The discovery of the
+master takes 0.1 to 0.3 s in threads of DDS. The imports for parsing and tables take as long. Both
+run in parallel if the participant is created first.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ASKING: Final = frozenset({
     "status", "ps", "apps", "history", "hosts", "plugins", "explain",
     "events", "logs", "top",
 })  # fmt: skip
-#: Those that also read the logs of slaves, or follow the load of the master, over DDS.
+#: Commands that also read the logs of slaves, or the load of the master, over DDS.
 _BEYOND_MASTER: Final = frozenset({"logs", "run", "top"})
 #: The sockets of this machine (of the network namespace), with a line for each.
 _SOCKETS: Final = Path("/proc/net/unix")

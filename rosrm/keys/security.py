@@ -71,7 +71,7 @@ class Security(Protocol):
         run: random number of the run of this master, slave or client.
         described: text for users, for example "the key of host:robot-1".
         tickets_from: lowest version of the tickets that are in force.
-        cluster: identifier of the secret of the cluster, which discloses no key; b"": no secret.
+        cluster: digest that identifies the cluster and discloses no key; b"": no keys.
     """
 
     run: bytes
@@ -472,7 +472,7 @@ def _tag(content: bytes, master: bytes) -> bytes:
 
 
 def _identifier(master: bytes) -> bytes:
-    """Return the identifier of a cluster from the master's public key, which strangers lack."""
+    """Return the identifier of a cluster, from the master's key that its members have."""
     return digest_of(master, 16, b"rosrm cluster")
 
 

@@ -109,9 +109,9 @@ class RosSettings:
         return self._in_force().get(INTERFACE_VARIABLE, "")
 
     def socket_name(self) -> tuple[str, str]:
-        """Return the parts of a name that two participants share only if they meet over ROS.
+        """Return the domain part of the name of a socket, and a text of other settings.
 
-        The first one holds the domain, the second one all else, also for participants that meet.
+        The text has the settings that can keep DDS participants of one domain apart.
         """
         joined = self._in_force()
         is_off = joined.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "").upper() == "OFF"

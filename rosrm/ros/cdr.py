@@ -222,8 +222,8 @@ def _array_reader(code: str) -> _Reader:
 def form_of(message: Any) -> bytes:
     """Return the CDR form of a message of rosrm: by `written` if its type contains a spec.
 
-    For other types rclpy is faster, such as long lists of flat messages (the rows of a listing).
-    Requests have no such lists, and a client may need no rclpy.
+    Requests too, so that a client needs no rclpy. For other types rclpy is faster, such as long
+    lists of flat messages (the rows of a listing).
     """
     if type(message).__name__.endswith("_Request") or _has_specs(type(message)):
         return written(message)

@@ -147,7 +147,7 @@ def _ask_until_answered(
 
     `servers` returns the number of discovered servers; another number repeats the request at once.
     `look`: seconds between two calls of `answers.wait`. `answers`: those of a request that may have
-    been sent in another way before.
+    been sent through the socket before.
 
     A server sends no answer before it has discovered the client's reader, and a new client's
     request may arrive earlier.
@@ -554,14 +554,14 @@ class MasterClient:
             answer = master_socket.ask(connection, content, until, answers.on_wait)
         response = calls.open(master, sent, answer)
         if response is None:
-            self._socket = ""  # DDS from now on, so that no other request waits in vain
+            self._socket = ""  # DDS from now on, so that no later request waits for this socket
         else:
             answers.first = (response,)
         if self._load is not None:
             _spin(self._participant, 0.0)  # takes the load that has arrived
 
     def _client(self, kind: Any, name: str) -> SealedClient:
-        """Return a client of a service of the master over DDS, which takes 0.1 s to discover it."""
+        """Return the client of a service over DDS, which takes 0.1 s to discover a new one."""
         path = self._names(name)
         if path not in self._clients:
             self._clients[path] = self._endpoints.client(
@@ -634,7 +634,7 @@ class MasterClient:
     ) -> Any:  # fmt: skip
         """Send a request until an answer comes; the receiver repeats a lost answer.
 
-        `ask` sends it until the deadline that it is given.
+        `ask` sends it until the `deadline` in its argument.
 
         Every request may be repeated: it only reads, or carries an id by which it is recognised.
         One that exceeds its bounds is not sent: `Refused` names the field.

@@ -3,9 +3,9 @@
 One connection carries one request and its answer. Each is a frame: its length (4 bytes, little
 endian), then for a request the name of the service and a NUL, then the CDR form of the envelope.
 The socket is abstract, so that it exists only in the network namespace of the master, as DDS over
-loopback, and leaves no file behind. Anyone on the machine may bind its name first. This is no
-risk, because answers are sealed; so with `security: none` there is no socket. This module imports
-no rclpy.
+loopback, and leaves no file behind. Any program on the machine can bind the name first. It can then
+delay requests, but not read or forge them, because messages are sealed. With `security: none` they
+are not, so there is no socket. This module imports no rclpy.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ _MOST_ANSWER: Final = (1 << 24) + (1 << 12)
 _LENGTH: Final = struct.Struct("<I")
 #: Most bytes that one system call reads.
 _PIECE: Final = 1 << 16
-#: Least seconds of a time-out, because 0 would mean none.
+#: Shortest time-out in seconds, because 0 makes the socket non-blocking.
 _SHORTEST: Final = 0.001
 #: Seconds between two calls of `on_wait`.
-_LOOK: Final = 0.1
+_REPORT_EVERY: Final = 0.1
 
 
 def address(settings: RosSettings, security: Security) -> str:
@@ -53,7 +53,7 @@ def connect(at: str) -> socket.socket | None:
         return None
     connection = socket.socket(socket.AF_UNIX)
     try:
-        connection.settimeout(_LOOK)  # a full queue is an error then, and not a wait
+        connection.settimeout(_REPORT_EVERY)  # a full queue raises an error then
         connection.connect(at)
     except OSError:
         connection.close()
@@ -84,7 +84,7 @@ def ask(
     answering.register(connection, select.POLLIN)
     try:
         send(connection, request, until)
-        while not answering.poll(_LOOK * 1e3):
+        while not answering.poll(_REPORT_EVERY * 1e3):
             if time.monotonic() >= until:
                 return None
             if on_wait is not None:

@@ -52,7 +52,7 @@ _MOST_RUNS: Final = 64
 _LARGEST: Final = 1 << 24
 
 #: Called with an envelope, None for a malformed message, and the function that sends its answer.
-Take = Callable[[Envelope | None, Callable[[Envelope], None]], None]
+SealedHandler = Callable[[Envelope | None, Callable[[Envelope], None]], None]
 
 SecurityT = TypeVar("SecurityT", bound=Security)
 
@@ -191,7 +191,7 @@ class SealedEndpoints(Generic[SecurityT]):
     Attributes:
         participant: owner of the entities.
         security: keys and peers of this master, slave or client.
-        takers: the receiver of the requests of each offered service, by its name.
+        handlers: of the requests of each offered service, by its name.
         refuses_other_runs: if True, answer requests for other runs of the receiver with `stale`; if
             False, do not answer them.
     """
@@ -204,7 +204,7 @@ class SealedEndpoints(Generic[SecurityT]):
         self.security = security
         self.refused = refused
         self.refuses_other_runs = True
-        self.takers: dict[str, Take] = {}
+        self.handlers: dict[str, SealedHandler] = {}
         _load_service()
 
     def _open(
@@ -269,7 +269,7 @@ class SealedEndpoints(Generic[SecurityT]):
 
             take(envelope_from_msg(request.message), send)
 
-        self.takers[name] = take
+        self.handlers[name] = take
         self.participant.serve(srv.Sealed, name, take_message)
 
     def client(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger("rosrm.master")
 
-#: Threads, and so connections at a time; as many others wait, and a client with one more uses DDS.
+#: Threads, and so connections at a time. About as many others wait; further clients use DDS.
 _THREADS: Final = 8
 #: Seconds for a request to arrive, and for its answer to be sent.
 _TRANSFER: Final = 1.0
@@ -44,7 +44,10 @@ class RequestSocket:
         try:
             self._listener.bind(address)
         except OSError as fault:
-            _log.warning("no socket for requests of this machine: %s", fault.strerror)
+            _log.warning(
+                "requests of this machine come over DDS, because the socket cannot be bound: %s",
+                fault.strerror,
+            )
             return
         self._listener.listen(_THREADS)
         for number in range(_THREADS):
@@ -69,10 +72,10 @@ class RequestSocket:
         until = time.monotonic() + _TRANSFER
         content = master_socket.receive(connection, master_socket.MOST_REQUEST, until)
         service, envelope = master_socket.service_and_envelope(content)
-        take = self._endpoints.takers.get(service)
+        take = self._endpoints.handlers.get(service)
         if take is not None and not self._closed.is_set():
             answers: queue.SimpleQueue[Envelope] = queue.SimpleQueue()
-            # In the order of all messages: a repetition over DDS, with a higher counter, is later.
+            # Queued behind earlier messages: a repetition over DDS must be opened after this one.
             self._endpoints.participant.post(take, envelope, answers.put)
             answer = encode(answers.get(timeout=_DECISION))
             master_socket.send(connection, answer, time.monotonic() + _TRANSFER)

@@ -35,7 +35,7 @@ class Side:
         post = lambda call, *arguments: call(*arguments)  # noqa: E731 - stands for the loop
         participant = SimpleNamespace(settings=SETTINGS, post=post)
         self.endpoints = SimpleNamespace(
-            participant=participant, security=self.security, takers={SERVICE: self.take}
+            participant=participant, security=self.security, handlers={SERVICE: self.take}
         )
 
     def take(self, envelope, send) -> None:
@@ -80,7 +80,7 @@ def test_a_request_is_answered_through_the_socket(side: Side) -> None:
          "no service", "an unknown service", "random bytes"],
 )  # fmt: skip
 def test_a_hostile_frame_is_dropped(side: Side, sent: bytes) -> None:
-    """Its connection is closed in time, no service sees it, and others are answered meanwhile."""
+    """The master closes its connection in time, and answers others; no service gets the frame."""
     hostile = [side.connect() for _ in range(request_socket._THREADS - 1)]
     for one in hostile:
         one.sendall(sent)
@@ -100,7 +100,7 @@ def _end_of(connection: socket.socket) -> bytes:
 
 
 def test_a_malformed_envelope_reaches_its_service_as_such(side: Side) -> None:
-    """The service counts it, as one over DDS, and nothing is answered."""
+    """The service counts it, as it does a malformed one over DDS, and does not answer."""
     with side.connect() as connection:
         request = SERVICE.encode() + b"\0" + b"no envelope"
         assert master_socket.ask(connection, request, time.monotonic() + PATIENCE, None) is None
@@ -132,10 +132,10 @@ def test_a_client_that_does_not_read_holds_up_no_other(side: Side) -> None:
 
 
 def test_a_request_without_an_answer_ends_at_its_time(side: Side, monkeypatch) -> None:
-    """The caller is told how long it has waited so far."""
+    """`on_wait` gets the seconds since the request."""
     monkeypatch.setattr(request_socket, "_DECISION", PATIENCE)
     late = []
-    side.endpoints.takers[SERVICE] = lambda _, send: late.append(send)
+    side.endpoints.handlers[SERVICE] = lambda _, send: late.append(send)
     waits: list[float] = []
     with side.connect() as connection:
         request = master_socket.request_of(SERVICE, ENVELOPE)
@@ -162,7 +162,7 @@ def test_a_name_in_use_is_left_to_its_owner(side: Side, caplog) -> None:
     with RequestSocket(side.endpoints):
         assert side.ask() == ENVELOPE
     assert side.ask() == ENVELOPE
-    assert "no socket for requests of this machine: Address already in use" in caplog.text
+    assert "because the socket cannot be bound: Address already in use" in caplog.text
 
 
 def test_after_the_end_nobody_listens_and_no_thread_is_left() -> None:
