@@ -45,6 +45,8 @@ if TYPE_CHECKING:
 
 #: Seconds between two checks for a service's discovery, for which rclpy has no event.
 _LOOK: Final = 0.005
+#: Least seconds between two reports to a caller that its request is not answered yet.
+_REPORT_EVERY: Final = 0.1
 #: Least seconds that a discovered master has for a request.
 _REQUEST: Final = 10.0
 #: Seconds for a reload, in which master and slaves check their files one after the other.
@@ -107,13 +109,17 @@ class _Answers:
     first: tuple[Any, ...] = ()
     sent: int = 0
     began: float = field(default_factory=time.monotonic)
+    reported: float = -math.inf
 
     def take(self, future: Any) -> None:
         self.first = self.first or (future.result(),)
 
     def wait(self) -> None:
-        if self.on_wait is not None:
-            self.on_wait(time.monotonic() - self.began)
+        """Call `on_wait` with the seconds since the request, at most every 0.1 s."""
+        now = time.monotonic()
+        if self.on_wait is not None and now - self.reported >= _REPORT_EVERY:
+            self.reported = now
+            self.on_wait(now - self.began)
 
     @property
     def answer(self) -> Any:
@@ -146,8 +152,8 @@ def _ask_until_answered(
     """Repeat a request until `deadline`; return the first answer.
 
     `servers` returns the number of discovered servers; another number repeats the request at once.
-    `look`: seconds between two calls of `answers.wait`. `answers`: those of a request that may have
-    been sent through the socket before.
+    `look`: most seconds between two calls of `answers.wait`. `answers`: those of a request that may
+    have been sent through the socket before.
 
     A server sends no answer before it has discovered the client's reader, and a new client's
     request may arrive earlier.
@@ -553,10 +559,10 @@ class MasterClient:
             answers.sent = 1
             answer = master_socket.ask(connection, content, until, answers.on_wait)
         response = calls.open(master, sent, answer)
-        if response is None:
-            self._socket = ""  # DDS from now on, so that no later request waits for this socket
-        else:
+        if response is not None:
             answers.first = (response,)
+        elif time.monotonic() >= until:
+            self._socket = ""  # DDS from now on, so that no later request waits for this socket
         if self._load is not None:
             _spin(self._participant, 0.0)  # takes the load that has arrived
 

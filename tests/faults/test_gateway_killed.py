@@ -11,6 +11,7 @@ import psutil
 from websockets.sync.client import connect
 
 from rosrm.ros import fast_dds
+from rosrm.ros.names import slave_node
 from tests.ros.clusters import host, job, service
 from tests.ros.web_kit import Gateway, gateway
 from tests.waiting import PATIENCE, wait_until
@@ -70,7 +71,7 @@ def test_nothing_notices_a_gateway_that_is_killed_20_times(make_cluster, monkeyp
         made.wait(name, "running")
     shorten_lease(monkeypatch, tmp_path)
     graph = made.client._participant.node.get_node_names
-    parts = {"rosrm_master", "rosrm_slave_robot_1", "rosrm_slave_robot_2"}
+    parts = {"rosrm_master", slave_node("robot-1"), slave_node("robot-2")}
     wait_until(
         lambda: parts <= set(graph()), "all parts in the graph", seen=graph, pause=made.client.spin
     )
