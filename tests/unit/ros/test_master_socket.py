@@ -185,7 +185,7 @@ def test_without_keys_there_is_no_socket() -> None:
 
 
 def test_master_and_user_of_a_cluster_have_the_same_address(monkeypatch) -> None:
-    """What keeps masters apart over DDS gives another one; the name discloses no key."""
+    """Masters that DDS keeps apart have different addresses, and no address discloses a key."""
     secret = ClusterSecret(os.urandom(32))
     key = secret.key_of(own_grant(Principal("user", "ada")))
     found = master_socket.address(SETTINGS, MasterSecurity(secret))
