@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
-from functools import cache
+from functools import cache, lru_cache
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeVar, Union, get_args, get_origin
@@ -231,7 +231,10 @@ def _field_reader(hint: Any) -> _Convert:
     read = _reader(hint)
     if not is_dataclass(hint) or not hint.__dataclass_params__.frozen:  # type: ignore[union-attr]
         return read
-    known: dict[bytes, Any] = {}
+
+    @lru_cache(maxsize=_MOST_SHARED)
+    def read_exact(exact: bytes) -> Any:
+        return read(marshal.loads(exact))  # noqa: S302 - the bytes are those of `read_once`
 
     def read_once(plain: Any) -> Any:
         if isinstance(plain, dict) and dict in map(type, plain.values()):
@@ -240,14 +243,7 @@ def _field_reader(hint: Any) -> _Convert:
             exact = marshal.dumps(plain, _MARSHAL)  # unlike `==`, tells 1, 1.0 and True apart
         except ValueError:  # another type than those of JSON
             return read(plain)
-        found = known.get(exact)
-        if found is None:
-            found = read(plain)
-            if len(exact) <= _LONGEST_SHARED:
-                if len(known) >= _MOST_SHARED:
-                    known.clear()
-                known[exact] = found
-        return found
+        return read_exact(exact) if len(exact) <= _LONGEST_SHARED else read(plain)
 
     return read_once
 

@@ -96,7 +96,7 @@ class RosSettings:
             conflict = "ROS_LOCALHOST_ONLY=1"
         elif joined.get("FASTDDS_BUILTIN_TRANSPORTS", "") not in ("", "UDPv4"):
             conflict = "transports other than UDPv4 (or FASTDDS_BUILTIN_TRANSPORTS)"
-        elif "fastrtps" not in (_rmw_of(joined)):
+        elif "fastrtps" not in _rmw_of(joined):
             conflict = f"RMW_IMPLEMENTATION={joined['RMW_IMPLEMENTATION']}"
         if interface and conflict:
             raise ConfigError(
