@@ -33,6 +33,9 @@ LAYERS = ("unit", "contract", "fuzz", "integration", "ros", "faults")
 #: The runs of pytest, in this order. A run with its output in a file runs beside the next ones.
 RUNS = (("contract",), ("fuzz",), ("unit",), ("integration",), ("ros", "faults"))
 BESIDE = "unit"
+#: Longest time, in seconds, of one test of that run: it has less priority than what it runs beside,
+#: and a test that takes 7 s alone has taken more than 120 s.
+LONGEST_BESIDE = 600
 
 #: Workers of the folders that run in parallel. Tests in real time mostly wait, so that a core
 #: serves two of them. With a ROS graph, each worker has a network of its own, if permitted. Tests
@@ -188,6 +191,7 @@ def run_pytest(
         # Each run has its own list of failed tests: two runs that end at once would lose one.
         *("-o", f"cache_dir=.pytest_cache/{name.removesuffix('-again')}"),
         *("--durations=20", "--durations-min=5"),
+        *(("-o", f"timeout={LONGEST_BESIDE}") if output else ()),
     ]
     with output.open("w") if output else nullcontext() as target:
         ended = subprocess.run([*command, *arguments], cwd=ROOT, check=False, stdout=target)

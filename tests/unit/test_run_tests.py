@@ -165,6 +165,16 @@ def test_what_failed_last_is_run_alone(run_tests):
     assert not any("unit" in line for line in lines)
 
 
+def test_a_test_beside_another_run_has_more_time(run_tests, tmp_path):
+    """It has less priority: on a busy machine a sound test took longer than the usual limit."""
+    with (tmp_path / "pytest.ini").open("a") as ini:
+        ini.write("timeout = 120\n")
+    limit = "def test_limit(pytestconfig): assert float(pytestconfig.getini('timeout')) == {}\n"
+    files = {"unit/test_a.py": limit.format(600), "ros/test_b.py": limit.format(120)}
+    status, _ = run_tests(files, "-p", "pytest_timeout")
+    assert status == 0
+
+
 def test_what_fails_beside_another_run_is_shown_and_remembered(run_tests):
     """The unit tests run beside the next folder: their output follows, and `--lf` finds both."""
     files = {"unit/test_a.py": FAILS, "integration/test_b.py": FAILS}
