@@ -46,8 +46,7 @@ _END: Final = 30.0
 #: The parts of a migration: executor and name of each one's own seconds.
 _PARTS: Final = {
     "prepare": (("criu_checkpoint", "prepare"),),
-    "dump": (("criu_checkpoint", "dump"),),
-    "compare": (("criu_checkpoint", "compare"),),
+    "dump": (("criu_checkpoint", "dump"), ("criu_checkpoint", "dump_compared")),
     "transfer": (("criu_checkpoint", "offer"), ("criu_fetch", "transfer")),
     "restore": (("criu_await_restored", "restore"),),
     "rejoin": (("criu_join", "join"),),

@@ -19,9 +19,10 @@ from typing import Any
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import dump, process_tree, restore_result
+from rosrm_criu.engine import dump, page_server, process_tree, restore_result
 from rosrm_criu.engine.binary import CriuBinary, find
 from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine.memory_copy import MemoryCopy
 from rosrm_criu.engine.probe import CriuSupport, probe
 from rosrm_criu.engine.restore_result import Outcome
 from tests.waiting import wait_until
@@ -110,12 +111,19 @@ class Theatre:
         self._processes.append(process)
         return Actor(process, log)
 
-    def dump(self, actor: Actor, name: str = "image", leave: dump.Leave = "killed") -> Path:
+    def dump(
+        self,
+        actor: Actor,
+        name: str = "image",
+        leave: dump.Leave = "killed",
+        copy: MemoryCopy | None = None,
+    ) -> Path:
         """Dump a process; return the directory of the image."""
         directory = self.folder / name
         self.manifest: Manifest = dump.dump(
             self.criu, actor.pid, directory, leave=leave, timeout=TIMEOUT, process="actor",
-            instance=1,
+            instance=1, checksums=copy is None,
+            receive=copy and functools.partial(page_server.serve, copy=copy),
         )  # fmt: skip
         if leave == "killed":
             actor.process.wait(TIMEOUT)

@@ -177,10 +177,15 @@ def test_the_master_or_a_slave_is_killed(criu, scene, victim, moment):
     assert len(scene.listener.checksums) == 1
 
 
-@pytest.mark.parametrize("victim", ["source's slave", "destination's slave"])
-def test_a_slave_is_killed_during_the_copy_of_the_memory(criu, large, victim):
+@pytest.mark.parametrize(
+    ("victim", "moment"),
+    [("source's slave", "copy"), ("destination's slave", "copy"), ("source's slave", "checkpoint")],
+)
+def test_a_slave_is_killed_during_the_copy_of_the_memory_or_its_comparison(
+    criu, large, victim, moment
+):
     """The node migrates with its whole memory, or stays, and no part of the copy is left."""
-    large.move("copy")
+    large.move(moment)
     large.kill(victim)
     large.end()
     assert min(large.listener.steps()) > 0

@@ -55,7 +55,7 @@ def test_memory_that_is_written_during_its_copy_arrives_as_it_was_left(criu, clu
         assert not ask(cluster)
         moved(cluster, times)
         event = cluster.wait_for_event("migrated", process=NAME, after=before)
-        assert "compare" in event.facts["parts"]["criu_checkpoint"], "the whole dump was sent"
+        assert "dump_compared" in event.facts["parts"]["criu_checkpoint"], "the whole dump was sent"
         listener.receive(100)  # all its memory is read again within 50 counts
     assert min(listener.steps()) == 1
     assert len(listener.checksums) == 1

@@ -119,7 +119,7 @@ def move_plan(move: Move, options: CriuOptions) -> Plan:
     start = options.start_timeout
     until_dumped = 2 * start + options.leave_timeout + options.dump_timeout
     seconds = {
-        "leave": options.leave_timeout, "dump": options.dump_timeout, "compare": start,
+        "leave": options.leave_timeout, "dump": options.dump_timeout,
         "offer": options.transfer_timeout + start,
     }  # fmt: skip
     keep = until_dumped + options.transfer_timeout + 4 * start

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -13,18 +16,25 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from rosrm_criu.engine import copied_pages, image, memory_copy, protobuf
-from rosrm_criu.engine.copied_pages import Entry, Pagemap
+from rosrm.errors import CriuError
+from rosrm_criu.engine import copied_pages, image, memory_copy, page_server, protobuf
+from rosrm_criu.engine.copied_pages import IN_PARENT, PRESENT, Entry
 from rosrm_criu.engine.image import GRANDPARENT, PAGES, PARENT
 from rosrm_criu.engine.memory_copy import CHANGES, PAGE, MemoryCopy, PageRange, file_name
 
 PID = 7
-IN_PARENT, PRESENT = 1, 4
+#: A process as CRIU names it to a page server.
+PROCESS = PID << 8 | 1
+OPEN, ADD, HAS_PARENT, END = 4, 6 | PRESENT << 16, 5, 0x1024
+NO_PAGES = PageRange(0, 0)
 #: Beginning of a pagemap of CRIU 4.2.1: the pages are in file 1, and its first page.
 SAMPLE = bytes.fromhex("1943565425400856 020000000801 0e0000000880c0f1b3bcb715100020042801")
 #: Contents by number of the page, of one process.
 memories = st.dictionaries(st.integers(0, 200), st.integers(0, 2), max_size=150)
 FULL = dict.fromkeys(range(200), 1)
+#: Most pages in a request of CRIU, and bytes that arrive at once.
+pieces = st.tuples(st.integers(1, 250), st.integers(1000, 1_000_000))
+WHOLE = (250, 1_000_000)
 
 
 def content(number: int) -> bytes:
@@ -32,32 +42,28 @@ def content(number: int) -> bytes:
     return bytes(PAGE - 1) + bytes([number])
 
 
-def ranges_of(memory: dict[int, int]) -> list[PageRange]:
-    """Return the pages of a memory as the longest possible ranges."""
+def ranges_of(memory: dict[int, int], most: int = 1000) -> list[PageRange]:
+    """Return the pages of a memory as the longest possible ranges of at most so many pages."""
     ranges: list[PageRange] = []
     for page in sorted(memory):
-        if ranges and ranges[-1].end == page * PAGE:
+        if ranges and ranges[-1].end == page * PAGE and ranges[-1].pages < most:
             ranges[-1] = PageRange(ranges[-1].begin, ranges[-1].pages + 1)
         else:
             ranges.append(PageRange(page * PAGE, 1))
     return ranges
 
 
-def write_pages(path: Path, memory: dict[int, int]) -> None:
-    path.write_bytes(b"".join(content(memory[page]) for page in sorted(memory)))
+def pages_of(memory: dict[int, int]) -> bytes:
+    return b"".join(content(memory[page]) for page in sorted(memory))
 
 
-def dump_after_copy(folder: Path, before: dict[int, int], after: dict[int, int]) -> MemoryCopy:
-    """Write the image of a memory, and a copy of it at an earlier time; return the copy."""
-    images, copies = folder / PAGES, folder / "copies"
-    images.mkdir()
+def copied(folder: Path, memory: dict[int, int]) -> MemoryCopy:
+    """Return a copy of a memory, beside the folder of an empty image."""
+    copies = folder / "copies"
     copies.mkdir()
-    entries = [Entry(one, PRESENT) for one in ranges_of(after)]
-    pagemap = Pagemap(SAMPLE[: protobuf.MAGIC], 1, entries)
-    (images / f"pagemap-{PID}.img").write_bytes(pagemap.encoded())
-    write_pages(images / "pages-1.img", after)
-    write_pages(copies / file_name(PID), before)
-    return MemoryCopy(copies, {PID: ranges_of(before)})
+    (folder / PAGES).mkdir()
+    (copies / file_name(PID)).write_bytes(pages_of(memory))
+    return MemoryCopy(copies, {PID: ranges_of(memory)})
 
 
 def copied_again(
@@ -68,13 +74,67 @@ def copied_again(
     marks = [between.get(page, before[page]) != before[page] for page in pages]
     newer = {page: between[page] for page, mark in zip(pages, marks, strict=True) if mark}
     (copy.directory / CHANGES).mkdir()
-    write_pages(copy.directory / CHANGES / file_name(PID), newer)
+    (copy.directory / CHANGES / file_name(PID)).write_bytes(pages_of(newer))
     return replace(copy, changed={PID: np.array(marks, np.bool_)}), {**before, **newer}
 
 
-def restored(images: Path) -> dict[int, bytes]:
+class Dump:
+    """CRIU that dumps to a page server.
+
+    Args:
+        to: descriptor of the connection.
+        at_once: bytes that are sent at once.
+    """
+
+    def __init__(self, to: int, at_once: int = 1_000_000) -> None:
+        self._peer, self._at_once = socket.socket(fileno=os.dup(to)), at_once
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._peer.close()
+
+    def request(self, command: int, which: int, pages=NO_PAGES, answer: int = 0) -> bytes:
+        """Send a request; return the answer, of so many bytes."""
+        self.send(struct.pack("IQQQ", command, pages.pages, pages.begin, which))
+        return self._peer.recv(answer, socket.MSG_WAITALL) if answer else b""
+
+    def send(self, data: bytes) -> None:
+        for at in range(0, len(data), self._at_once):
+            self._peer.sendall(data[at : at + self._at_once])
+
+    def process(self, which: int, memory: dict[int, int], most: int = 1000) -> None:
+        """Send a memory, at most so many pages in a request."""
+        assert self.request(HAS_PARENT, which, answer=4) == bytes(4)
+        assert self.request(OPEN, which, answer=1) == bytes(1)
+        data, at = pages_of(memory), 0
+        for pages in ranges_of(memory, most):
+            self.request(ADD, which, pages=pages)
+            self.send(data[at : at + pages.pages * PAGE])
+            at += pages.pages * PAGE
+
+    def end(self) -> None:
+        assert self.request(END, 0, answer=4) == bytes(4)
+
+
+def dumped(folder: Path, copy: MemoryCopy, memory: dict[int, int], how=WHOLE) -> dict[str, int]:
+    """Dump a memory through a page server; return the sizes of the files that it names."""
+    most, at_once = how
+
+    def run(to: int) -> None:
+        with Dump(to, at_once) as dump:
+            dump.process(PROCESS, memory, most)
+            dump.end()
+
+    sizes = page_server.serve(run, folder, copy)
+    assert sizes is not None
+    return sizes
+
+
+def restored(images: Path, name: str = f"pagemap-{PID}.img") -> dict[int, bytes]:
     """Return the pages of an image as CRIU reads them: marked ones from the parent."""
-    head, *entries = protobuf.messages((images / f"pagemap-{PID}.img").read_bytes())
+    head, *entries = protobuf.messages((images / name).read_bytes())
     (number,) = (one.value for one in protobuf.fields(head))
     pages = (images / f"pages-{number}.img").read_bytes()
     parent = restored(images / "parent") if (images / "parent").exists() else {}
@@ -90,107 +150,146 @@ def restored(images: Path) -> dict[int, bytes]:
     return found
 
 
-@given(memories, memories)
-@example(FULL, FULL)
-@example(FULL, {**FULL, 3: 2, 64: 2})
-def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before, after):
-    """Pages may be mapped, unmapped or written after the copy; only the changed ones are sent.
+def contents(memory: dict[int, int]) -> dict[int, bytes]:
+    return {page: content(number) for page, number in memory.items()}
 
-    A dump with few equal pages is sent whole.
+
+def sent_pages(folder: Path) -> int:
+    return (folder / PAGES / "pages-1.img").stat().st_size // PAGE
+
+
+@given(memories, memories, pieces)
+@example(FULL, FULL, WHOLE)
+@example(FULL, {**FULL, 3: 2, 64: 2}, (7, 1000))
+def test_any_dump_is_restored_exactly_from_its_changed_pages_and_the_copy(before, after, how):
+    """Pages may be mapped, unmapped or written after the copy; only the changed ones are written.
+
+    They arrive in pieces of any size.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        copy = dump_after_copy(folder, before, after)
-        sizes = copied_pages.remove_copied_pages(folder, copy, lambda: None)
-        sent = (folder / PAGES / "pages-1.img").stat().st_size // PAGE
-        copied_pages.move_into_parent(folder, copy.directory)
-        expected = {page: content(number) for page, number in after.items()}
+        copy = copied(folder, before)
+        sizes = dumped(folder, copy, after, how)
         changed = sum(before.get(page) != number for page, number in after.items())
-        assert restored(folder / PAGES) == expected
-        if before and (len(after) - changed) * 8 >= len(after):
-            assert sent == changed
-            assert sizes == {f"{PARENT}/{file_name(PID)}": len(before) * PAGE}
-        else:
-            assert sent == len(after)
-            assert sizes == {}
+        assert sent_pages(folder) == changed
+        uses = {f"{PARENT}/{file_name(PID)}": len(before) * PAGE}
+        assert sizes == (uses if changed < len(after) else {})
+        copied_pages.move_into_parent(folder, copy.directory)
+        assert restored(folder / PAGES) == contents(after)
 
 
-@given(memories, memories, memories)
-@example(FULL, {**FULL, 3: 2}, FULL)
-@example(FULL, {**FULL, 3: 2}, {**FULL, 3: 2, 64: 2})
-def test_any_dump_is_restored_exactly_from_two_copies(before, between, after):
+@given(memories, memories, memories, pieces)
+@example(FULL, {**FULL, 3: 2}, FULL, WHOLE)
+@example(FULL, {**FULL, 3: 2}, {**FULL, 3: 2, 64: 2}, (7, 1000))
+def test_any_dump_is_restored_exactly_from_two_copies(before, between, after, how):
     """The second copy has the pages that had changed by then; the newer content counts."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        copy, newest = copied_again(dump_after_copy(folder, before, after), before, between)
-        sizes = copied_pages.remove_copied_pages(folder, copy, lambda: None)
-        sent = (folder / PAGES / "pages-1.img").stat().st_size // PAGE
+        copy, newest = copied_again(copied(folder, before), before, between)
+        sizes = dumped(folder, copy, after, how)
+        changed = sum(newest.get(page) != number for page, number in after.items())
+        assert sent_pages(folder) == changed
+        both = {f"{one}/{file_name(PID)}" for one in (PARENT, GRANDPARENT)}
+        assert sizes.keys() == (both if changed < len(after) else set())
         named = {**image.file_sizes(folder), **sizes}
         copied_pages.move_into_parent(folder, copy.directory)
         assert image.file_sizes(folder) == named
-        assert restored(folder / PAGES) == {page: content(one) for page, one in after.items()}
-        changed = sum(newest.get(page) != number for page, number in after.items())
-        if before and (len(after) - changed) * 8 >= len(after):
-            assert sent == changed
-            assert sizes.keys() == {f"{one}/{file_name(PID)}" for one in (PARENT, GRANDPARENT)}
-        else:
-            assert sent == len(after)
+        assert restored(folder / PAGES) == contents(after)
 
 
 def test_the_format_is_that_of_criu():
-    """A pagemap that CRIU wrote is written again as the same bytes."""
-    found = Pagemap.decoded(SAMPLE)
-    assert (found.file, [one.pages for one, _ in found.entries]) == (1, [1])
-    assert found.encoded() == SAMPLE
+    """The bytes of a pagemap are those of CRIU's file with the same page."""
+    _, entry = protobuf.messages(SAMPLE)
+    address = next(one.value for one in protobuf.fields(entry) if one.number == 1)
+    assert copied_pages.encoded(1, [Entry(PageRange(address, 1), PRESENT)]) == SAMPLE
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda data: data.replace(b"\x20\x04", b"\x20\x0c"),  # an unknown flag
-        lambda data: data.replace(b"\x20\x04", b"\x38\x04"),  # an unknown field
-        lambda data: data.replace(b"\x28\x01", b"\x28\x02"),  # more pages than the file has
-        lambda data: data[:-1],
-    ],
-)
-def test_a_dump_of_an_unknown_form_stays_as_it_is(tmp_path, change):
-    """The whole dump can be sent then."""
-    copy = dump_after_copy(tmp_path, {5: 1}, {5: 1})
-    pagemap = tmp_path / PAGES / f"pagemap-{PID}.img"
-    pagemap.write_bytes(change(pagemap.read_bytes()))
-    before = {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()}
-    with pytest.raises((ValueError, KeyError)):
-        copied_pages.remove_copied_pages(tmp_path, copy, lambda: None)
-    assert {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()} == before
+def test_processes_without_a_copy_and_shared_memory_are_written_whole(tmp_path):
+    """A child is new, another one has ended before the dump, and shared memory is not copied."""
+    copy = copied(tmp_path, FULL)
+    for pid, memory in ((8, {}), (9, {0: 1})):
+        (copy.directory / file_name(pid)).write_bytes(pages_of(memory))
+    copy = replace(copy, ranges={**copy.ranges, 8: [], 9: ranges_of({0: 1})})
+    dumps = {
+        f"pagemap-{PID}.img": (PROCESS, {**FULL, 3: 2}),
+        "pagemap-8.img": (8 << 8 | 1, {1: 1}),
+        "pagemap-10.img": (10 << 8 | 1, {2: 1}),
+        "pagemap-shmem-7.img": (7 << 8 | 2, FULL),
+    }
 
+    def run(to: int) -> None:
+        with Dump(to) as dump:
+            for which, memory in dumps.values():
+                dump.process(which, memory)
+            dump.end()
 
-def too_late() -> None:
-    raise ValueError("it is too late")
-
-
-def test_a_comparison_can_be_ended(tmp_path):
-    """The whole dump can be sent then."""
-    copy = dump_after_copy(tmp_path, FULL, FULL)
-    before = {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()}
-    with pytest.raises(ValueError, match="too late"):
-        copied_pages.remove_copied_pages(tmp_path, copy, too_late)
-    assert {path.name: path.read_bytes() for path in (tmp_path / PAGES).iterdir()} == before
-
-
-def test_copies_that_the_dump_does_not_use_stay_out_of_the_image(tmp_path):
-    """A small child has no copied pages; another child has ended before the dump."""
-    copy = dump_after_copy(tmp_path, FULL, FULL)
-    images = tmp_path / PAGES
-    for small in ("pagemap-8.img", "pages-2.img"):
-        (images / small).write_bytes(b"of a small child")
-    for pid, pages in ((8, 0), (9, 1)):
-        write_pages(copy.directory / file_name(pid), dict.fromkeys(range(pages), 1))
-    ranges = {**copy.ranges, 8: [], 9: ranges_of({0: 1})}
-    found = MemoryCopy(copy.directory, ranges)
-    sizes = copied_pages.remove_copied_pages(tmp_path, found, lambda: None)
+    sizes = page_server.serve(run, tmp_path, copy)
     named = {**image.file_sizes(tmp_path), **sizes}
     copied_pages.move_into_parent(tmp_path, copy.directory)
     assert image.file_sizes(tmp_path) == named
+    for name, (_, memory) in dumps.items():
+        assert restored(tmp_path / PAGES, name) == contents(memory)
+
+
+@pytest.mark.parametrize(
+    ("command", "which"),
+    [
+        (9, PROCESS),  # unknown
+        (6 | IN_PARENT << 16, PROCESS),  # pages that are not sent
+        (6 | (8 | PRESENT) << 16, PROCESS),  # an unknown flag
+        (ADD, PROCESS + (1 << 8)),  # pages of another process
+        (OPEN, 9),  # an image of another kind
+    ],
+)
+def test_an_unexpected_request_ends_the_connection_and_allows_another_dump(
+    tmp_path, command, which
+):
+    """CRIU then lets the processes run on, and they can be dumped whole."""
+    answers = []
+
+    def run(to: int) -> None:
+        with Dump(to) as dump:
+            dump.request(OPEN, PROCESS, answer=1)
+            answers.append(dump.request(command, which, pages=PageRange(0, 1), answer=1))
+            raise CriuError("the page server does not answer")
+
+    assert page_server.serve(run, tmp_path, copied(tmp_path, FULL)) is None
+    assert answers == [b""]
+
+
+def test_pages_that_cannot_be_written_allow_another_dump(tmp_path):
+    """So does a copy with another number of pages than its ranges."""
+    copy = copied(tmp_path, FULL)
+    with (copy.directory / file_name(PID)).open("ab") as file:
+        file.write(content(0))
+
+    def run(to: int) -> None:
+        with Dump(to) as dump:
+            dump.request(OPEN, PROCESS, answer=1)
+        raise CriuError("the page server does not answer")
+
+    assert page_server.serve(run, tmp_path, copy) is None
+
+
+@pytest.mark.parametrize("code", [0, 1])
+def test_a_criu_that_ends_early_leaves_no_image(tmp_path, code):
+    """Its own error is reported; without an error, the processes can be dumped again."""
+
+    def run(to: int) -> None:
+        with Dump(to) as dump:
+            dump.request(OPEN, PROCESS, answer=1)
+            dump.request(ADD, PROCESS, pages=PageRange(0, 2))
+            dump.send(content(1))
+        if code:
+            raise CriuError("it cannot be dumped")
+
+    copy = copied(tmp_path, FULL)
+    if code:
+        with pytest.raises(CriuError, match="cannot be dumped"):
+            page_server.serve(run, tmp_path, copy)
+    else:
+        assert page_server.serve(run, tmp_path, copy) is None
+    assert not (tmp_path / PAGES / f"pagemap-{PID}.img").exists()
 
 
 # --- the copy ---------------------------------------------------------------------------------
@@ -256,6 +355,10 @@ def test_what_has_changed_since_is_copied_once_more(tmp_path, holder):
     assert data[at : at + PAGE] == b"\2" + b"\1" * (PAGE - 1)
     assert begin + 4 * PAGE not in changed
     assert (first.directory / file_name(holder.pid)).read_bytes() == before
+
+
+def too_late() -> None:
+    raise ValueError("it is too late")
 
 
 def test_a_copy_can_be_ended(tmp_path, holder):

@@ -11,8 +11,10 @@ import contextlib
 import errno
 import os
 import platform
+import shutil
 import signal
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
@@ -32,11 +34,13 @@ _FREEZE: Final = 10
 #: Seconds for a signal to stop or continue a process.
 _SIGNAL: Final = 5.0
 
+#: Function that runs a dump, given a page server's descriptor, and receives its pages.
+Receive = Callable[[Callable[[int], None], Path], Mapping[str, int] | None]
 #: State of the process after the dump.
 Leave = Literal["stopped", "running", "killed"]
 
 
-def dump(
+def dump(  # noqa: PLR0913 - two of them name the process
     criu: CriuBinary,
     pid: int,
     directory: Path,
@@ -46,6 +50,7 @@ def dump(
     process: str = "",
     instance: int = 0,
     checksums: bool = True,
+    receive: Receive | None = None,
 ) -> Manifest:
     """Dump a process tree, and return the manifest of the image.
 
@@ -63,6 +68,8 @@ def dump(
         instance: its number, for the manifest.
         checksums: add checksums of the files, which reads the image once more. Needed for an image
             that is stored on disk, but not for one that is sent to another host at once.
+        receive: receives the pages from CRIU, see `page_server.serve`. The manifest also has the
+            files that this function names, so add no checksums.
 
     Raises:
         CriuError: the process cannot be dumped, or the dump failed; the process runs as before.
@@ -78,11 +85,12 @@ def dump(
     image.create(directory)
     try:
         image.check_room(directory, process_tree.memory_of(pids))
-        _run(criu, root, directory, timeout, process)
+        copied = _run(criu, root, directory, timeout, process, receive)
         manifest = _describe(root, directory, Manifest(
             process, instance, platform.node(), time.time(), criu.version, platform.release(),
             platform.machine(), inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
+        manifest = replace(manifest, sizes={**manifest.sizes, **copied})
         if leave == "running" and not was_stopped:
             resume(pid)  # only files are read from here on, so the process may run
         if checksums:
@@ -119,16 +127,32 @@ def kill(pid: int) -> None:
     process_tree.send(reversed(process_tree.tree(process_tree.root_of(pid))), signal.SIGKILL)
 
 
-def _run(criu: CriuBinary, root: int, directory: Path, timeout: float, process: str) -> None:
+def _run(
+    criu: CriuBinary, root: int, directory: Path, timeout: float, process: str,
+    receive: Receive | None,
+) -> Mapping[str, int]:  # fmt: skip
+    """Run CRIU; return the bytes of the files that the image lacks, by path."""
+    images = directory / image.PAGES
     arguments = (
-        "dump", "--tree", str(inner_pid(root)), "--images-dir", str(directory / image.PAGES),
+        "dump", "--tree", str(inner_pid(root)), "--images-dir", str(images),
         "--leave-stopped", *COMMON, "--timeout", str(_FREEZE),
         "--ghost-limit", str(open_files.MOST),
     )  # fmt: skip
     inside = replace(criu, command=(*process_tree.entering(root), *criu.command))
-    log = directory / image.DUMP_LOG
+
+    def run(*more: str, pass_fds: Sequence[int] = ()) -> None:
+        log = directory / image.DUMP_LOG
+        inside.run((*arguments, *more), timeout=timeout, log=log, pass_fds=pass_fds)
+
+    def send_pages(to: int) -> None:
+        run("--page-server", "--ps-socket", str(to), pass_fds=[to])
+
     try:
-        inside.run(arguments, timeout=timeout, log=log)
+        copied = receive(send_pages, directory) if receive else None
+        if copied is None:
+            shutil.rmtree(images)  # files of an attempt to receive the pages
+            images.mkdir(mode=0o700)
+            run()
     except CriuError as error:
         meaning = _meaning(root, str(error))
         if not meaning:
@@ -136,6 +160,7 @@ def _run(criu: CriuBinary, root: int, directory: Path, timeout: float, process: 
         raise CriuError(f"{process or f'pid {root}'} cannot be dumped: {meaning}") from None
     if not process_tree.wait_until_stopped(process_tree.tree(root), _SIGNAL):
         raise CriuError(f"{process or f'pid {root}'} did not stop for its dump")
+    return copied or {}
 
 
 def _meaning(root: int, message: str) -> str:

@@ -23,7 +23,7 @@ from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.messages import State, Status, read_message
 from rosrm_criu.engine import dump, process_tree, received
 from rosrm_criu.engine.binary import find
-from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine.image import PARENT
 from rosrm_criu.engine.paths import incoming, outgoing
 from rosrm_criu.engine.probe import criu_support
 from rosrm_criu.executors import artifacts, attempts, periodic, precopy
@@ -95,9 +95,7 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         began = time.monotonic()
         left = leave(pid, control, asked.attempt, float(asked.arguments["seconds"]["leave"]))
         dumped = time.monotonic()
-        directory, manifest = _dump(pid, asked)
-        compared = time.monotonic()
-        is_partial = precopy.leave_out_copied(asked, directory, manifest)
+        directory, dump_part = _dump(pid, asked)
         offered = time.monotonic()
         offer = _offer(sender, directory, asked)
     except Exception:  # any error: the node rejoins
@@ -109,8 +107,7 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
         "seconds": {
-            "prepare": dumped - began, "leave": left, "dump": compared - dumped,
-            **({"compare": offered - compared} if is_partial else {}),
+            "prepare": dumped - began, "leave": left, dump_part: offered - dumped,
             "offer": time.monotonic() - offered,
         },
     }  # fmt: skip
@@ -156,7 +153,8 @@ def end(arguments: Answer) -> Answer:
     return {}
 
 
-def _dump(pid: int, asked: StepArguments) -> tuple[Path, Manifest]:
+def _dump(pid: int, asked: StepArguments) -> tuple[Path, str]:
+    """Return the directory of the image, and the name of this part of the move."""
     directory = outgoing(asked.state, asked.source)
     artifacts.discard(directory)
     attempts.check_wanted(asked.attempt)
@@ -165,8 +163,10 @@ def _dump(pid: int, asked: StepArguments) -> tuple[Path, Manifest]:
             find(), pid, directory, leave="stopped",
             timeout=float(asked.arguments["seconds"]["dump"]),
             process=asked.process, instance=asked.source, checksums=False,
+            receive=precopy.receiver(asked),
         )  # fmt: skip
-    return directory, manifest
+    is_compared = any(name.startswith(f"{PARENT}/") for name in manifest.sizes)
+    return directory, "dump_compared" if is_compared else "dump"
 
 
 def _offer(sender: Sender, directory: Path, asked: StepArguments) -> Offer:

@@ -12,13 +12,12 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import copied_pages, image, memory_copy, process_tree
-from rosrm_criu.engine.image import Manifest
+from rosrm_criu.engine import copied_pages, dump, image, memory_copy, page_server, process_tree
 from rosrm_criu.engine.memory_copy import CHANGES, MemoryCopy, file_name
 from rosrm_criu.engine.paths import numbers, received_copy, sent_copy
 from rosrm_criu.executors import artifacts, attempts
@@ -186,38 +185,17 @@ def _offer(
     return {"offer": offer.as_json()}
 
 
-def leave_out_copied(asked: StepArguments, directory: Path, manifest: Manifest) -> bool:
-    """Remove from a dump the pages that are equal in the copy at the destination.
-
-    Args:
-        asked: arguments of the step.
-        directory: of the image.
-        manifest: of the image.
-
-    Returns:
-        True if the dump now refers to the copy; False: it is as before.
-
-    Raises:
-        CriuError: the attempt was given up.
-    """
+def receiver(asked: StepArguments) -> dump.Receive | None:
+    """Return the function that leaves pages out of a dump; None: the destination has no copy."""
     with _changing:
         sent = _sent.get(asked.source)
     while sent is not None and sent.offer != asked.results[INTRODUCE].get("copy"):
         sent = sent.former
-    if sent is None:
-        return False
-    try:
-        check = _check_until(asked.attempt, float(asked.arguments["seconds"]["compare"]))
-        copied = copied_pages.remove_copied_pages(directory, sent.copy, check)
-    except (OSError, ValueError, KeyError):  # the whole dump is sent
-        return False
-    sizes = {**image.file_sizes(directory), **copied}
-    image.write(directory, replace(manifest, sizes=sizes))
-    return True
+    return None if sent is None else functools.partial(page_server.serve, copy=sent.copy)
 
 
 def _check_until(attempt: str, seconds: float) -> Callable[[], None]:
-    """Return a check of a copy or comparison under way.
+    """Return a check of a copy under way.
 
     Args:
         attempt: id of the migration attempt; if it was given up, the check raises CriuError.
