@@ -32,6 +32,13 @@ RUN_BYTES: Final = 16
 #: Largest counter. The first is 1.
 LAST_COUNTER: Final = 2**64 - 1
 
+# Looked up once, because a master opens thousands of messages a second.
+_decrypt: Final = lib.crypto_aead_chacha20poly1305_ietf_decrypt
+_from_buffer: Final = ffi.from_buffer
+_NULL: Final = ffi.NULL
+#: Packs 0 and the counter of a message into its nonce.
+_pack_nonce: Final = struct.Struct("<IQ").pack
+
 
 class Direction(str, Enum):
     """Direction of the messages that a key seals."""
@@ -66,10 +73,6 @@ def channel_key(principal_key: bytes, direction: Direction, run: bytes, channel:
     return derived(principal_key, direction.value, run, channel)
 
 
-def _nonce(counter: int) -> bytes:
-    return struct.pack("<IQ", 0, counter)
-
-
 def _check_key(key: bytes) -> None:
     """Raise `ValueError` for a key of another length; libsodium would read beyond its end."""
     if len(key) != KEY_BYTES:
@@ -101,8 +104,8 @@ class Sealer:
         self.counter += 1
         sealed = bytearray(len(plaintext) + OVERHEAD)
         lib.crypto_aead_chacha20poly1305_ietf_encrypt(
-            ffi.from_buffer(sealed), ffi.NULL, plaintext, len(plaintext), context, len(context),
-            ffi.NULL, _nonce(self.counter), self._key,
+            _from_buffer(sealed), _NULL, plaintext, len(plaintext), context, len(context),
+            _NULL, _pack_nonce(0, self.counter), self._key,
         )  # fmt: skip
         return bytes(sealed)
 
@@ -124,12 +127,13 @@ class Opener:
 
     def open(self, counter: int, sealed: bytes, context: bytes = b"") -> bytes | None:
         """Return the plaintext; None if the message is forged or repeated."""
-        if not self.newest < counter <= LAST_COUNTER or len(sealed) < OVERHEAD:
+        size = len(sealed)
+        if not self.newest < counter <= LAST_COUNTER or size < OVERHEAD:
             return None
-        plaintext = bytearray(len(sealed) - OVERHEAD)
-        failed = lib.crypto_aead_chacha20poly1305_ietf_decrypt(
-            ffi.from_buffer(plaintext), ffi.NULL, ffi.NULL, sealed, len(sealed),
-            context, len(context), _nonce(counter), self._key,
+        plaintext = bytearray(size - OVERHEAD)
+        failed = _decrypt(
+            _from_buffer(plaintext), _NULL, _NULL, sealed, size, context, len(context),
+            _pack_nonce(0, counter), self._key,
         )  # fmt: skip
         if failed:
             return None

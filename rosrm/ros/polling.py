@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,12 +32,9 @@ def waiting(subscription: Any, most: int = _AT_A_TIME) -> Iterator[tuple[Any, An
     Their number is limited, so the loop ends even if messages arrive faster than it takes them.
     """
     handle = subscription.handle
+    take = partial(handle.take_message, subscription.msg_type, subscription.raw)
     with handle:
-        for _ in range(most):
-            taken = handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                return
-            yield taken
+        yield from islice(iter(take, None), most)
 
 
 def message_type(name: str) -> Any:

@@ -19,6 +19,9 @@ from rosrm_msgs import msg
 
 #: Encapsulation (little-endian plain CDR, no options), host, format, counter, length of the body.
 _HEAD: Final = struct.Struct("<4sIIQI")
+#: Where a message has the number of its host, and its body.
+_HOST_ID: Final = slice(4, 8)
+_BODY: Final = slice(_HEAD.size, None)
 _CDR: Final = b"\x00\x01\x00\x00"
 _BODY_BYTES: Final = READING_BYTES + OVERHEAD
 _SIZE: Final = _HEAD.size + _BODY_BYTES
@@ -83,10 +86,10 @@ def open_reading(
     if len(data) != _SIZE:
         return None
     _, host_id, form, counter, length = _HEAD.unpack_from(data)
-    slave = slave_of(host_id) if (form, length) == (FORMAT, _BODY_BYTES) else None
+    slave = slave_of(host_id) if form == FORMAT and length == _BODY_BYTES else None
     if slave is None:
         return None
-    plain = slave.open(counter, data[_HEAD.size :], master_run)
-    if plain is None or plain[HOST_ID] != data[4:8]:
+    plain = slave.open(counter, data[_BODY], master_run)
+    if plain is None or plain[HOST_ID] != data[_HOST_ID]:
         return None
     return plain[:READING_BYTES]

@@ -90,24 +90,28 @@ def decode(messages: Sequence[bytes]) -> Decoded:
         rows = rows[ours]
         if not len(rows):
             return Decoded(refusals=tuple(refusals))
-    order, begins = _by_run(rows)
-    last = order[np.append(begins[1:], len(rows)) - 1]
-    newest = rows.view(_ROW)[last].view(LAYOUT)
+    order, begins, ends = _by_run(rows)
+    newest = rows.view(_ROW)[order[ends]].view(LAYOUT)
     runs = _runs(rows, order, begins, newest)
     return Decoded(_event(newest), runs, tuple(refusals), len(rows))
 
 
-def _by_run(rows: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+def _by_run(
+    rows: npt.NDArray[np.void],
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp], npt.NDArray[np.intp]]:
     """Group rows by run, so that a former run's late messages do not hide the present run's.
 
     Returns:
-        The order of the rows by run of a slave, oldest first in each, and the start of each run.
+        The order of the rows by run of a slave, oldest first in each; in it, the first and the last
+        row of each run.
     """
     run = rows["host_id"].astype(np.uint64) << np.uint64(32)
     run |= rows["incarnation"] & np.uint64(0xFFFFFFFF)
-    order = np.argsort(run, kind="stable")
-    another = np.diff(run[order]) != 0
-    return order, np.append(0, np.flatnonzero(another) + 1)
+    order = run.argsort(kind="stable")
+    run = run[order]
+    is_bound = np.ones(len(rows) + 1, np.bool_)
+    is_bound[1:-1] = run[1:] != run[:-1]
+    return order, is_bound[:-1].nonzero()[0], is_bound[1:].nonzero()[0]
 
 
 def _runs(

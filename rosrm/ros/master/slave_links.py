@@ -125,6 +125,8 @@ class HostLinks:
 
     Attributes:
         decided_at: unix time of the newest decision, ns, for the traces of starts.
+        slave_of: returns the slave of a host; None: it has not registered, or its key was revoked.
+            Called for each reading, so it reads one dictionary.
     """
 
     def __init__(
@@ -139,6 +141,8 @@ class HostLinks:
         self._readings = reading_channel(self._names(names.RESOURCE_INFO))
         self._client = ControlClient(endpoints.participant, sender)
         self._links: dict[int, HostLink] = {}
+        self._slaves: dict[int, RegisteredSlave] = {}
+        self.slave_of: Callable[[int], RegisteredSlave | None] = self._slaves.get
         # Of a thousand links few have pending work, so only those are checked.
         self._waiting: set[int] = set()
         self._with_work: set[int] = set()
@@ -160,11 +164,6 @@ class HostLinks:
         link = self._links.get(host_id)
         return link is not None and link.is_of(sender)
 
-    def slave_of(self, host_id: int) -> RegisteredSlave | None:
-        """Return the slave of a host; None: it has not registered, or its key was revoked."""
-        link = self._links.get(host_id)
-        return None if link is None else link.slave
-
     def registered(self, host_id: int) -> HostLink | None:
         """Return the link of a registered slave; None: there is none with a valid key."""
         link = self._links.get(host_id)
@@ -185,7 +184,7 @@ class HostLinks:
         if link is None or link.slave is None or link.slave.peer is not peer:
             link = self._new_link(host_id, description.name, slave)
             self._links[host_id] = link
-        link.slave = slave
+        link.slave = self._slaves[host_id] = slave
         link.search()
         self._first_readings_until = link.searched_from + _FIRST_READING
         link.close_poll()
@@ -219,6 +218,7 @@ class HostLinks:
         for link in self._links.values():
             if link.slave is not None and not has_access(link.slave.peer):
                 link.slave = None
+                del self._slaves[link.host_id]
                 self._shut(link)
                 self.reading_stats.forget(link.host_id)
                 self._handle(happened.KeyRevoked(link.host_id, link.incarnation))

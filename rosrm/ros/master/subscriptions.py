@@ -60,10 +60,14 @@ class SlaveSubscriptions:
 
     def poll_readings(self) -> happened.ReadingsReceived | None:
         """Take all received readings; None: there are none."""
-        taken = [
-            opened for sealed, _ in waiting(self._readings, qos.READINGS.depth)
-            if (opened := self._opened(sealed)) is not None
-        ]  # fmt: skip
+        run, slave_of = self._endpoints.security.run, self._links.slave_of
+        taken = []
+        for sealed, _ in waiting(self._readings, qos.READINGS.depth):
+            plain = open_reading(sealed, run, slave_of)
+            if plain is not None:
+                taken.append(plain)
+            elif not may_be_of_former_run(sealed, slave_of, time.monotonic()):
+                self._endpoints.refused(self._topic)
         if not taken:
             return None
         batch = decode(taken)
@@ -73,13 +77,6 @@ class SlaveSubscriptions:
         for refusal in batch.refusals:
             self._refuse("resource_info", "resource_info", refusal)
         return batch.readings
-
-    def _opened(self, sealed: bytes) -> bytes | None:
-        run, slave_of = self._endpoints.security.run, self._links.slave_of
-        plain = open_reading(sealed, run, slave_of)
-        if plain is None and not may_be_of_former_run(sealed, slave_of, time.monotonic()):
-            self._endpoints.refused(self._topic)
-        return plain
 
     def _of_host(self, take: Callable[[Any], None]) -> Callable[[Any, Peer], None]:
         """Wrap a callback: pass on messages about a host only from the slave of this host."""
