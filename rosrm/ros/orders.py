@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from copy import copy
 from typing import Final, get_args
 
 from rosrm.errors import Refused
@@ -30,6 +31,8 @@ from rosrm.ros import convert
 from rosrm_msgs import srv
 
 _Request = srv.ControlHost.Request
+#: Copied for each order: the constructor would make the spec of a process and its 18 policies.
+_EMPTY: Final = _Request()
 _ACTIONS: Final[Mapping[type[Order], int]] = {
     StopInstance: _Request.STOP,
     RestartInstance: _Request.RESTART,
@@ -56,7 +59,8 @@ _ALONE: Final[Mapping[int, Callable[[], Order]]] = {
 
 def order_to_msg(order: Order) -> srv.ControlHost.Request:
     """Return an order as a request without its envelope."""
-    request = _Request(action=_ACTIONS[type(order)])
+    request = copy(_EMPTY)
+    request.action = _ACTIONS[type(order)]
     match order:
         case RunExecutor(executor, arguments, timeout):
             request.executor, request.timeout = executor, float(timeout)

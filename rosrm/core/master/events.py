@@ -355,6 +355,11 @@ class OrderAnswered:
         return _BY_CODE.get(self.code, OrderOutcome.REFUSED)
 
     @property
+    def is_measurement(self) -> bool:
+        """Return True for the report of a host on its links, which decides nothing."""
+        return isinstance(self.order, tuple) and self.order[0] == "links"
+
+    @property
     def reason(self) -> str:
         """Return the slave's message on an order that was not accepted, or else the code."""
         return self.message or self.code

@@ -122,10 +122,10 @@ class MasterEndpoint:
         """Return the events since the last call, in order, preceded by the newest readings.
 
         Args:
-            queued: False if no process is queued. Then requests for work decide nothing, and the
-                readings can wait for the next tick.
+            queued: False if no process is queued. Then requests for work and measurements of links
+                decide nothing, and the readings can wait for the next tick.
         """
-        if not self._begin_with_readings() and (queued or not self._are_requests_for_work()):
+        if not self._begin_with_readings() and (queued or not all(map(_is_routine, self.events))):
             self._guard.call(self._take_readings)
         events = list(self.events)
         self.events.clear()
@@ -133,9 +133,6 @@ class MasterEndpoint:
 
     def _begin_with_readings(self) -> bool:
         return not self.events or isinstance(self.events[0], happened.ReadingsReceived)
-
-    def _are_requests_for_work(self) -> bool:
-        return all(isinstance(event, happened.ProcessRequested) for event in self.events)
 
     def beat(self, uptime: float, silent_hosts: Sequence[int], journal: int) -> None:
         """Publish the master's beat, and its load at most once a second.
@@ -177,3 +174,10 @@ class MasterEndpoint:
                 f"{max(oldest, default=0.0):.2f} s old",
             )
         )  # fmt: skip
+
+
+def _is_routine(event: happened.Event) -> bool:
+    """Return True for an event that decides nothing while no process is queued."""
+    if isinstance(event, happened.OrderAnswered):
+        return event.is_measurement
+    return isinstance(event, happened.ProcessRequested)

@@ -71,6 +71,14 @@ def test_an_order_is_the_same_after_its_way_to_the_slave(order):
     assert order_from_msg(order_to_msg(order)) == order
 
 
+def test_no_field_of_an_order_is_in_the_next_one():
+    """All orders are copies of one empty request."""
+    for order in ORDERS:
+        order_to_msg(order)
+    empty = srv.ControlHost.Request(action=srv.ControlHost.Request.REPORT)
+    assert order_to_msg(ReportInstances()) == empty
+
+
 @pytest.mark.parametrize("seconds", [float("nan"), float("inf"), -1.0, 4e8])
 @pytest.mark.parametrize("order", [ORDERS[-4], ORDERS[-3]], ids=["timeout", "replicate_every"])
 def test_an_order_with_a_time_that_never_ends_is_refused(order, seconds):
