@@ -95,7 +95,7 @@ class Bench:
         policy = ScoringLink("weighted", Weighted(WeightedOptions()))
         further = ScoringLink("network", Network(NetworkOptions()), 0.5, ("talks_to",))
         placement = PlacementPlugins((policy, further) if network else (policy,))
-        self.state = MasterState(CoreSettings(), placement, {}, epoch=1)
+        self.state = MasterState(CoreSettings(max_hosts=hosts), placement, {}, epoch=1)
         described = tuple(
             ResourceDescription(name, unit, capacity)
             for name, unit, capacity in (
