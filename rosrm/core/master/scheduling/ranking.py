@@ -75,7 +75,7 @@ class Ranking:
         self._flows: FlowView | None = None
         self._alone: Ranking | None = None
         self.value: FloatArray
-        self._lowest: list[int] | None
+        self._best_tier: Shortlist | None
         self._judge_all()
 
     def _judge_all(self) -> None:
@@ -174,15 +174,12 @@ class Ranking:
 
     def best(self) -> int:
         """Return the column with the lowest value; -1: none fits."""
-        best = self.lowest()
+        best = self._preferred().lowest(1)
         return best[0] if best else -1
 
     def lowest(self) -> list[int]:
         """Return the few fitting columns with the lowest values, best first."""
-        if self._lowest is None:
-            tier, listed = self._tier, self._shortlist
-            self._lowest = (listed if tier is None else self._preferred(tier)).lowest()
-        return self._lowest
+        return self._preferred().lowest()
 
     def fitting(self) -> int:
         """Return the number of hosts that may take the process now."""
@@ -229,11 +226,12 @@ class Ranking:
 
     def _set_values(self, value: FloatArray) -> None:
         """Set `value` of all hosts."""
-        self.value, self._shortlist, self._lowest = value, Shortlist(value), None
+        self.value, self._shortlist, self._best_tier = value, Shortlist(value), None
 
     def _put(self, columns: list[int], values: list[float]) -> None:
         self._shortlist.put(columns, values)
-        self._lowest = None
+        if self._tier is not None:
+            self._best_tier = None
 
     def _judge_ahead(self, column: int) -> None:
         """Set `value` of a column that just took a process of this demand.
@@ -309,12 +307,14 @@ class Ranking:
         self.failure = f"{self.failure}; {reason}" if self.failure else reason
         self._ahead.clear()
 
-    def _preferred(self, tier: IntArray) -> Shortlist:
-        """Return the hosts of the best tier of labels among fitting hosts."""
-        fitting = self.value < np.inf
-        if not fitting.any():
-            return self._shortlist
-        return Shortlist(np.where(tier == tier[fitting].min(), self.value, np.inf))
+    def _preferred(self) -> Shortlist:
+        """Return the shortlist of the best tier of labels among fitting hosts."""
+        if self._best_tier is None:
+            self._best_tier, tier = self._shortlist, self._tier
+            if tier is not None and (fitting := self.value < np.inf).any():
+                value = np.where(tier == tier[fitting].min(), self.value, np.inf)
+                self._best_tier = Shortlist(value)
+        return self._best_tier
 
 
 def _answer(

@@ -14,9 +14,10 @@ from rosrm.core.master.state.host_arrays import FloatArray
 WANTED: Final = 4
 #: Number of columns that a search finds after single values have changed, to need fewer searches.
 _AHEAD: Final = 8
-#: Number of changed values, or of columns in the list, above which a new search costs less.
+#: Number of changed values above which a new search costs less; the list has no more columns.
 MOST: Final = 12
-#: Sorts after each finite value.
+#: Sort before and after each finite value.
+_ALL: Final = (-inf, -1)
 _NONE: Final = (inf, -1)
 
 
@@ -33,15 +34,15 @@ class Shortlist:
     def __init__(self, value: FloatArray) -> None:
         self._value = value
         self._finite: int | None = None
-        self._lowest: list[tuple[float, int]] | None = None
-        self._end = _NONE  # each finite value that is not in the list comes after this one
-        self._searched = WANTED
+        self._lowest: list[tuple[float, int]] = []
+        self._end = _ALL  # each finite value that is not in the list comes after this one
+        self._changed = False
 
-    def lowest(self) -> list[int]:
-        """Return the few columns with the lowest values, in order."""
-        if self._lowest is None:
-            self._lowest = self._search()
-        return [column for _, column in self._lowest[:WANTED]]
+    def lowest(self, wanted: int = WANTED) -> list[int]:
+        """Return the columns with the lowest values, in order; fewer only if no more are finite."""
+        if len(self._lowest) < wanted and self._end is not _NONE:
+            self._search(_AHEAD if self._changed else wanted)
+        return [column for _, column in self._lowest[:wanted]]
 
     def finite(self) -> int:
         """Return the number of finite values."""
@@ -51,28 +52,32 @@ class Shortlist:
 
     def put(self, columns: list[int], values: list[float]) -> None:
         """Replace the values of some columns, each of which is given once."""
+        self._changed = True
         for column, new in zip(columns, values, strict=True):
             old = float(self._value[column])
             self._value[column] = new
             if self._finite is not None:
                 self._finite += (new < inf) - (old < inf)
-            if self._lowest is not None and new != old:
-                self._move(self._lowest, (old, column), (new, column))
+            if new != old:
+                self._move((old, column), (new, column))
 
-    def _move(
-        self, lowest: list[tuple[float, int]], old: tuple[float, int], new: tuple[float, int]
-    ) -> None:
+    def _move(self, old: tuple[float, int], new: tuple[float, int]) -> None:
+        lowest = self._lowest
         if old <= self._end:
             lowest.remove(old)
         if new <= self._end:
             insort(lowest, new)
-        if len(lowest) > MOST or (len(lowest) < WANTED and self._end is not _NONE):
-            self._lowest, self._searched = None, _AHEAD
+        if len(lowest) > MOST:
+            del lowest[_AHEAD:]
+            self._end = lowest[-1]
 
-    def _search(self) -> list[tuple[float, int]]:
-        value, found = self._value, list[tuple[float, int]]()
+    def _search(self, wanted: int) -> None:
+        """Search for further columns until the list has `wanted`, or all with finite values."""
+        value, found = self._value, self._lowest
+        for _, column in found:
+            value[column] = inf
         self._end = _NONE
-        for _ in range(min(self._searched, len(value))):
+        for _ in range(min(wanted, len(value)) - len(found)):
             column = int(value.argmin())
             lowest = float(value[column])
             if lowest == inf:
@@ -83,4 +88,3 @@ class Shortlist:
             self._end = found[-1] if len(found) < len(value) else _NONE
         for lowest, column in found:
             value[column] = lowest
-        return found
