@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from operator import attrgetter
 from typing import Final, get_args
 
 from rosrm.model.values import (
     MOST_USED,
     Enforcement,
-    Limits,
     ProcessSpec,
-    Realtime,
     RealtimePolicy,
 )
 from rosrm.wording import amount
@@ -20,18 +19,15 @@ LEAST_MEMORY: Final = 4e6
 #: Cores: the kernel allows no less than 1 ms in 100 ms.
 LEAST_CPU: Final = 0.01
 LARGEST_CPU_NUMBER: Final = 65_535
-_NO_LIMITS: Final = Limits()
-_NO_REALTIME: Final = Realtime()
+_limits_of: Final = attrgetter("limits", "cpus", "realtime", "nice")
+_NO_LIMITS: Final = _limits_of(ProcessSpec(""))
 #: Unit of each limit.
 _UNITS: Final = {"memory": "B", "memory_high": "B", "cpu": "core"}
 
 
 def limits_fault(spec: ProcessSpec) -> str:
     """Return the first fault of limits, cpus, realtime and nice, with its key; "": none."""
-    plain = not (spec.cpus or spec.nice)
-    if plain and spec.limits == _NO_LIMITS and spec.realtime == _NO_REALTIME:
-        return ""
-    return next(_faults(spec), "")
+    return "" if _limits_of(spec) == _NO_LIMITS else next(_faults(spec), "")
 
 
 def _faults(spec: ProcessSpec) -> Iterator[str]:

@@ -262,7 +262,7 @@ class MasterState:
         self, process: Process, phase: ProcessPhase, now: float, reason: str = ""
     ) -> None:
         """Move a process to another phase; a run of a schedule ends in the phase SCHEDULED."""
-        if process.spec.schedule and phase in _ENDS_OF_RUNS:
+        if phase in _ENDS_OF_RUNS and process.spec.schedule:
             phase, reason = self._after_run(process, phase, reason)
         process.reason = reason
         if process.phase is not phase:
@@ -496,8 +496,8 @@ class MasterState:
         """Add an instance on the host that a ranking has chosen."""
         demand = ranking.demand
         # Without devices the slave refuses the instance, and the process is placed elsewhere.
-        needs, devices = demand.spec.devices, self.hosts.devices[host.column]
-        chosen = (devices.choose(needs) or ()) if needs else ()
+        needs = demand.spec.devices
+        chosen = (self.hosts.devices[host.column].choose(needs) or ()) if needs else ()
         need = ranking.need[:, host.column]
         self.add_instance(instance, host, now, demand, need, devices=chosen)
 

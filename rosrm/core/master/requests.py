@@ -35,7 +35,6 @@ from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import container_conflict, no_standby
 from rosrm.extensions.plugin_calls import implements, required
-from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.adoption_rules import adoption_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.limits import limits_fault
@@ -71,7 +70,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_gangs(state, specs, event.by.name)
     check_quota(state, specs, event.by)
-    adopted = {spec.name: spec.adoption for spec in specs if spec.adoption != NO_ADOPTION}
+    adopted = {spec.name: spec.adoption for spec in specs if spec.adoption.host}
     for adoption in adopted.values():
         check_adoption(state, adoption, now)
     processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
@@ -113,7 +112,7 @@ def add_process(
     state.next_order += 1
     state.add_process(process)
     if not await_first_run(state, process, now):
-        state.enqueue(process, now)
+        state.put_in_queue(process)
     message = f"{process.name} was submitted"
     state.record(now, EventKind.SUBMITTED, message, process=process.name, by=by)
     state.save(process)

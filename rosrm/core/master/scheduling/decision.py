@@ -81,12 +81,14 @@ class Moment:
 
     Attributes:
         judges: the scoring policies that decided.
+        failure: why policies were left out.
         hosts: with copies of all that assignments change.
         value: score plus tie-break of each host; inf where the host did not fit.
         standing: for each host the first failed filter that assignments do not change.
     """
 
     judges: tuple[ScoringLink, ...]
+    failure: str
     hosts: Candidates
     value: list[float]
     standing: tuple[Refusal | None, ...]
@@ -134,6 +136,14 @@ class Moment:
             return _failure_notes(rows, error)
 
     @property
+    def policy(self) -> str:
+        """Return the names of the policies that decided, and those left out, with reasons."""
+        name = " + ".join(map(str, self.judges))
+        if not self.failure:
+            return name
+        return f"{name} ({self.failure})" if name else self.failure
+
+    @property
     def plugins(self) -> PluginCalls:
         """Return the guard of the calls of plugins."""
         return self.hosts.demand.plugins.calls
@@ -151,19 +161,15 @@ class Decision(Lazy):
 
     Attributes:
         column: column of the chosen host; -1: none fits now.
-        policy: name of the policy that decided, and the policies left out, with reasons.
         omitted: verdict to the number of hosts with that verdict that are not named.
     """
 
-    __slots__ = ("_moment", "column", "kind", "omitted", "policy")
+    __slots__ = ("_moment", "column", "kind", "omitted")
 
-    def __init__(
-        self, column: int, policy: str, moment: Moment, omitted: Mapping[str, int]
-    ) -> None:
+    def __init__(self, column: int, moment: Moment, omitted: Mapping[str, int]) -> None:
         super().__init__()
         self.kind: DecisionKind = ""
         self.column = column
-        self.policy = policy
         self.omitted = omitted
         self._moment = moment
 
@@ -177,7 +183,7 @@ class Decision(Lazy):
         verdicts = self.verdicts
         return {
             "kind": self.kind,
-            "policy": self.policy,
+            "policy": self._moment.policy,
             "chosen": verdicts[0].host if self.column >= 0 else None,
             "need": dict(self._moment.hosts.demand.amounts),
             "hosts": [verdict.to_json() for verdict in verdicts],
@@ -196,7 +202,7 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
     listed = ranking.table.listed()
     if len(listed) <= _NAMED_HOSTS:
         moment = _moment(ranking, _first(column, [host.column for host in listed]))
-        return Decision(column, ranking.policy_name, moment, EMPTY)
+        return Decision(column, moment, EMPTY)
     # With many hosts, only the runners-up are named, because this path must be quick.
     first = [host.column for host in listed[:_NAMED_HOSTS]] if column < 0 else ranking.lowest()
     moment = _moment(ranking, _first(column, first))
@@ -206,12 +212,12 @@ def decide(ranking: Ranking, *, chosen: int | None = None) -> Decision:
         "would take it at a higher score": fitting - named_fitting,
         "cannot take it now": len(listed) - fitting - (named - named_fitting),
     }
-    return Decision(column, ranking.policy_name, moment, omitted)
+    return Decision(column, moment, omitted)
 
 
 def _first(column: int, columns: Sequence[int]) -> list[int]:
     """Return the columns, the chosen one first; if it is not among them, it replaces the last."""
-    if column < 0:
+    if column < 0 or columns[:1] == [column]:
         return list(columns)
     others = [other for other in columns if other != column]
     return [column, *(others[:-1] if len(others) == len(columns) else others)]
@@ -249,7 +255,7 @@ def _moment(ranking: Ranking, columns: list[int]) -> Moment:
     standing = ranking.standing_refusals(columns) if inf in value else (None,) * len(columns)
     if ranking.reads_tenants:
         hosts.keep_tenants()
-    return Moment(ranking.judges, hosts, value, standing)
+    return Moment(ranking.judges, ranking.failure, hosts, value, standing)
 
 
 def _verdicts(moment: Moment, *, chosen: bool) -> tuple[Verdict, ...]:

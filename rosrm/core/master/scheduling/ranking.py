@@ -90,14 +90,6 @@ class Ranking:
         self._ahead: dict[int, list[float]] = {}
         self._judge(judged)
 
-    @property
-    def policy_name(self) -> str:
-        """Return the names of the policies in use, and the policies left out, with reasons."""
-        name = " + ".join(map(str, self.judges))
-        if not self.failure:
-            return name
-        return f"{name} ({self.failure})" if name else self.failure
-
     def beside(self, demand: Demand) -> Ranking:
         """Return this ranking for a demand that differs by its neighbours and flows alone.
 
@@ -159,18 +151,16 @@ class Ranking:
                 self._all = None
             self._judge_all()
             return
-        touched = self.table.touched
-        if len(touched) == self._seen:
+        touched = self.table.touched[self._seen :]
+        self._seen += len(touched)
+        if len(touched) == 1 and self._own == self._seen and not self.reads_tenants:
+            self._judge_ahead(touched[0])
             return
-        columns = set(touched[self._seen :])
-        alone = self._seen == len(touched) - 1
-        self._seen = len(touched)
-        if alone and self._own == len(touched) and not self.reads_tenants:
-            self._judge_ahead(columns.pop())
-            return
+        columns = set(touched)
         for column in columns & self._ahead.keys():
             del self._ahead[column]
-        self._judge_at(np.fromiter(columns, np.int64, len(columns)))
+        if columns:
+            self._judge_at(np.fromiter(columns, np.int64, len(columns)))
 
     def best(self) -> int:
         """Return the column with the lowest value; -1: none fits."""

@@ -88,6 +88,7 @@ class Host:
     """
 
     column: int
+    name: str
     description: HostDescription
     cordoned: bool = False
     draining: bool = False
@@ -110,11 +111,6 @@ class Host:
     def host_id(self) -> int:
         """Return the number under which this host reports; 0 is never used."""
         return self.column + 1
-
-    @property
-    def name(self) -> str:
-        """Return the name of the host."""
-        return self.description.name
 
     def enforces(self, settings: tuple[str, ...], cpus: tuple[int, ...]) -> bool:
         """Return True if the host can enforce these settings, and is not known to lack a CPU."""
@@ -169,7 +165,7 @@ class HostTable(HostColumns):
         self, name: str, now: float = 0.0, *, cordoned: bool = False, draining: bool = False
     ) -> Host:
         """Add a host before its first contact, so that its number stays across restarts."""
-        host = Host(self.add_column(), HostDescription(name, 0))
+        host = Host(self.add_column(), name, HostDescription(name, 0))
         self.hosts.append(host)
         self.devices.add_column()
         self.by_name[name] = host
