@@ -258,28 +258,29 @@ class Ranking:
         columns = judged.columns
         judged.known_flows = self.flows(columns)
         fits = passing(BY_ASSIGNMENT, judged, self._standing[columns])
-        value = self.table.ties[columns]
+        value = self.table.ties[columns].copy()
         if judged.more is not None:
             value = np.multiply(judged.processes, TIE, dtype=np.float64)
         if self._preference is not None:
-            value = value + self._preference[columns]
+            value += self._preference[columns]
         return self._scored(self.judges, judged, fits, value)
 
     def _scored(
         self, judges: Sequence[ScoringLink], judged: Candidates, fits: BoolArray, value: FloatArray
     ) -> FloatArray | None:
-        """Add the scores of policies to values; None: a policy was left out, so all are void."""
+        """Add the scores of policies to `value`; None: a policy was left out, so all are void."""
         for link in judges if np.count_nonzero(fits) else ():
             try:
                 score, veto = _answer(link, judged, fits)
             except PluginError as error:
                 self._leave_out(link, error)
                 return None
-            value = score + value
+            value += score
             if veto is not None:
                 fits = fits & ~veto
         self.reads_tenants = self.reads_tenants or judged.tenants_read
-        return np.where(fits, value, np.inf)
+        value[~fits] = np.inf
+        return value
 
     def flows(self, columns: Columns) -> FlowView | None:
         """Return the flows of the process on some hosts; None: no plugin has read them."""
