@@ -336,6 +336,24 @@ def test_the_memory_of_a_running_process_is_copied(tmp_path, holder):
     assert file.stat().st_mode & 0o777 == 0o600
 
 
+def test_an_area_that_is_listed_twice_is_copied_once(tmp_path, holder, monkeypatch):
+    """It grows while the kernel lists the areas; CRIU would restore its first copy of a page."""
+    begin = int(holder.stdout.readline())
+    areas = ((begin, 1 << 19), (begin, 1 << 20), (begin + (1 << 18), 1 << 18))
+    text = "".join(
+        f"{start:x}-{start + size:x} rw-p 00000000 00:00 0\nAnonymous: {size >> 10} kB\n"
+        for start, size in areas
+    )
+    monkeypatch.setattr(memory_copy.Path, "read_text", lambda *_, **__: text)
+    copy = memory_copy.copy([holder.pid], tmp_path / "copy", lambda: None)
+    half = (1 << 19) // PAGE
+    assert copy.ranges[holder.pid] == [
+        PageRange(begin, half),
+        PageRange(begin + (1 << 19), half),
+    ]
+    assert (copy.directory / file_name(holder.pid)).stat().st_size == 1 << 20
+
+
 def test_what_has_changed_since_is_copied_once_more(tmp_path, holder):
     """The new pages are in a file of their own, and the first copy stays as it was."""
     begin = int(holder.stdout.readline())

@@ -186,13 +186,18 @@ def _opened(pid: int, path: Path) -> Iterator[tuple[FileIO, int, int]]:
 
 
 def _areas(pid: int) -> Iterator[tuple[int, int, int]]:
-    """Yield begin, end and anonymous bytes of the large areas of a process; raise OSError."""
-    begin = end = 0
+    """Yield begin, end and anonymous bytes of the large areas of a process; raise OSError.
+
+    An area that grows while the kernel lists it is listed twice. Its pages must be in one area
+    only, because CRIU would restore its first copy of a page, whichever copy the dump equals.
+    """
+    begin = end = listed = 0
     for line in Path(f"/proc/{pid}/smaps").read_text(errors="replace").splitlines():
         if found := _AREA.match(line):
             begin, end = (int(number, 16) for number in found.groups())
         elif line.startswith("Anonymous:") and (size := int(line.split()[1]) << 10) >= _LEAST:
-            yield begin, end, size
+            yield max(begin, listed), end, size
+            listed = max(listed, end)
 
 
 def _held(pagemap: int, begin: int, end: int) -> Iterator[PageRange]:
