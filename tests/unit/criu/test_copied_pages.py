@@ -8,7 +8,9 @@ import struct
 import subprocess
 import sys
 import tempfile
+import threading
 from dataclasses import replace
+from io import BufferedWriter
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +23,7 @@ from rosrm_criu.engine import copied_pages, image, memory_copy, page_server, pro
 from rosrm_criu.engine.copied_pages import IN_PARENT, PRESENT, Entry
 from rosrm_criu.engine.image import GRANDPARENT, PAGES, PARENT
 from rosrm_criu.engine.memory_copy import CHANGES, PAGE, MemoryCopy, PageRange, file_name
+from tests.waiting import PATIENCE
 
 PID = 7
 #: A process as CRIU names it to a page server.
@@ -257,8 +260,42 @@ def test_an_unexpected_request_ends_the_connection_and_allows_another_dump(
     assert answers == [b""]
 
 
-def test_pages_that_cannot_be_written_allow_another_dump(tmp_path):
-    """So does a copy with another number of pages than its ranges."""
+def test_a_full_disk_allows_another_dump(tmp_path, monkeypatch):
+    """The attempt may have filled it, and its files are removed first."""
+
+    def new_file(_: Path) -> BufferedWriter:
+        return Path("/dev/full").open("wb")
+
+    monkeypatch.setattr(page_server, "new_file", new_file)
+
+    def run(to: int) -> None:
+        with Dump(to) as dump:
+            dump.process(PROCESS, dict.fromkeys(range(200), 2))
+            with pytest.raises((OSError, AssertionError)):
+                dump.end()
+        raise CriuError("the page server does not answer")
+
+    assert page_server.serve(run, tmp_path, copied(tmp_path, FULL)) is None
+
+
+def test_a_process_that_outlives_criu_does_not_hold_up_the_dump(tmp_path):
+    """It has inherited CRIU's end of the connection, and the node is frozen."""
+    timers = []
+
+    def run(to: int) -> None:
+        timers.append(threading.Timer(PATIENCE, os.close, [os.dup(to)]))
+        timers[0].start()
+        raise CriuError("it was killed")
+
+    with pytest.raises(CriuError, match="it was killed"):
+        page_server.serve(run, tmp_path, copied(tmp_path, FULL))
+    assert timers[0].is_alive()
+    timers[0].cancel()
+    os.close(*timers[0].args)
+
+
+def test_a_copy_of_another_size_allows_another_dump(tmp_path):
+    """Its pages cannot be assigned to their addresses."""
     copy = copied(tmp_path, FULL)
     with (copy.directory / file_name(PID)).open("ab") as file:
         file.write(content(0))

@@ -62,8 +62,11 @@ def serve(run: Callable[[int], None], directory: Path, copy: MemoryCopy) -> dict
     with ThreadPoolExecutor(1, "page-server") as pool:
         received = pool.submit(_receive, ours, directory, copy)
         try:
-            with theirs:  # the end of CRIU, or of this block, ends the receiver too
-                run(theirs.fileno())
+            with theirs:
+                try:
+                    run(theirs.fileno())
+                finally:  # ends the receiver, even if a process that CRIU has left has this end too
+                    theirs.shutdown(socket.SHUT_RDWR)
         except CriuError:
             if isinstance(received.exception(), EOFError | ConnectionError | None):
                 raise
