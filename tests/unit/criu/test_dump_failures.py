@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import signal
 import subprocess
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -66,6 +69,33 @@ def test_a_process_runs_on_before_its_useless_image_is_removed(
     with pytest.raises(CriuError, match="cannot be written: No space left"):
         dump.dump(criu, process.pid, tmp_path / "image", leave="stopped", timeout=5.0)
     assert stopped == [False]
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_a_second_dump_has_the_rest_of_the_timeout(tmp_path, criu, process, monkeypatch, again):
+    """With less than half of the timeout it does not begin: a killed CRIU can harm the process."""
+    seconds = 0.2 if again else 1.2
+    timeouts: list[float] = []
+
+    def run(*_: object, timeout: float, **__: object) -> None:
+        timeouts.append(timeout)
+        process.send_signal(signal.SIGSTOP)
+
+    def receive(run: Callable[[int], None], _: Path) -> None:
+        run(2)
+        dump.resume(process.pid)
+        time.sleep(seconds)
+
+    monkeypatch.setattr(CriuBinary, "run", run)
+    too_late = pytest.raises(CriuError, match="could not be received")
+    with contextlib.nullcontext() if again else too_late:
+        dump.dump(
+            criu, process.pid, tmp_path / "image", leave="stopped", timeout=20.0 if again else 2.0,
+            checksums=False, receive=receive,
+        )  # fmt: skip
+    assert len(timeouts) == (2 if again else 1)
+    assert timeouts[-1] < timeouts[0] - seconds or not again
+    assert process_tree.is_stopped(process.pid) is again
 
 
 def test_a_file_that_cannot_be_put_back_leaves_nothing(tmp_path, monkeypatch):

@@ -9,9 +9,11 @@ from itertools import count
 
 import pytest
 
+from rosrm.errors import CriuError
+from rosrm_criu.engine import page_server
 from rosrm_criu.engine.memory_copy import CHANGES, file_name
 from rosrm_criu.engine.paths import received_copy, sent_copy
-from rosrm_criu.executors import artifacts, precopy
+from rosrm_criu.executors import artifacts, attempts, precopy
 from rosrm_criu.executors.request import StepArguments
 from rosrm_criu.plans import (
     COPY_CHANGES,
@@ -19,6 +21,7 @@ from rosrm_criu.plans import (
     EXPECT_COPY,
     FETCH_CHANGES,
     FETCH_COPY,
+    INTRODUCE,
     MEASURE_MEMORY,
 )
 from rosrm_criu.transfer import Sender, missing
@@ -193,6 +196,21 @@ def test_a_copy_that_is_undone_while_it_is_under_way_is_given_up(steps):
     precopy.remove_copy(steps.arguments())
     assert "was undone" in steps.call(COPY_MEMORY, precopy.copy_memory)["skipped"]
     assert not list((steps.folder / "images").iterdir())
+
+
+def test_a_move_that_is_undone_while_pages_are_received_dumps_no_second_time(steps, monkeypatch):
+    """The slave cannot receive them; the node rejoins instead."""
+    steps.until_offered()
+    steps.fetch()
+    steps.results[INTRODUCE] = {"copy": steps.received}
+    receive = precopy.receiver(StepArguments.of(steps.arguments()))
+
+    def serve(*_, **__):
+        attempts.turn_back(f"p#{steps.number}")
+
+    monkeypatch.setattr(page_server, "serve", serve)
+    with pytest.raises(CriuError, match="was undone"):
+        receive(lambda _: None, steps.folder)
 
 
 @pytest.mark.parametrize("fetched", [False, True])

@@ -69,7 +69,8 @@ def dump(  # noqa: PLR0913 - two of them name the process
         checksums: add checksums of the files, which reads the image once more. Needed for an image
             that is stored on disk, but not for one that is sent to another host at once.
         receive: receives the pages from CRIU, see `page_server.serve`. The manifest also has the
-            files that this function names, so add no checksums.
+            files that this function names, so add no checksums. If it cannot receive the pages, a
+            second dump begins, unless half of the timeout has passed.
 
     Raises:
         CriuError: the process cannot be dumped, or the dump failed; the process runs as before.
@@ -140,9 +141,17 @@ def _run(
     )  # fmt: skip
     inside = replace(criu, command=(*process_tree.entering(root), *criu.command))
 
+    end = time.monotonic() + timeout
+
     def run(*more: str, pass_fds: Sequence[int] = ()) -> None:
+        left = end - time.monotonic()
+        if left < timeout / 2:  # CRIU would be killed before its end, which can harm the process
+            raise CriuError(
+                "its pages could not be received, and less than half of the time-out of "
+                f"{timeout:g} s is left for another dump"
+            )
         log = directory / image.DUMP_LOG
-        inside.run((*arguments, *more), timeout=timeout, log=log, pass_fds=pass_fds)
+        inside.run((*arguments, *more), timeout=left, log=log, pass_fds=pass_fds)
 
     def send_pages(to: int) -> None:
         run("--page-server", "--ps-socket", str(to), pass_fds=[to])

@@ -11,7 +11,7 @@ import functools
 import threading
 import time
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -191,7 +191,17 @@ def receiver(asked: StepArguments) -> dump.Receive | None:
         sent = _sent.get(asked.source)
     while sent is not None and sent.offer != asked.results[INTRODUCE].get("copy"):
         sent = sent.former
-    return None if sent is None else functools.partial(page_server.serve, copy=sent.copy)
+    if sent is None:
+        return None
+    copy = sent.copy
+
+    def receive(run: Callable[[int], None], directory: Path) -> Mapping[str, int] | None:
+        sizes = page_server.serve(run, directory, copy)
+        if sizes is None:  # the second dump may take long, so begin none for an undone move
+            attempts.check_wanted(asked.attempt)
+        return sizes
+
+    return receive
 
 
 def _check_until(attempt: str, seconds: float) -> Callable[[], None]:
