@@ -31,7 +31,8 @@ from rosrm.ros import convert
 from rosrm_msgs import srv
 
 _Request = srv.ControlHost.Request
-#: Copied for each order: the constructor would make the spec of a process and its 18 policies.
+#: Copied for each order, because the constructor also makes a spec with 18 policies. The copies
+#: share its nested messages, so these are replaced and never changed.
 _EMPTY: Final = _Request()
 _ACTIONS: Final[Mapping[type[Order], int]] = {
     StopInstance: _Request.STOP,

@@ -19,7 +19,7 @@ from rosrm_msgs import msg
 
 #: Encapsulation (little-endian plain CDR, no options), host, format, counter, length of the body.
 _HEAD: Final = struct.Struct("<4sIIQI")
-#: Where a message has the number of its host, and its body.
+#: Positions of the host's number and of the body in a message.
 _HOST_ID: Final = slice(4, 8)
 _BODY: Final = slice(_HEAD.size, None)
 _CDR: Final = b"\x00\x01\x00\x00"

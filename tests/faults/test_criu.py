@@ -181,7 +181,7 @@ def test_the_master_or_a_slave_is_killed(criu, scene, victim, moment):
     ("victim", "moment"),
     [("source's slave", "copy"), ("destination's slave", "copy"), ("source's slave", "checkpoint")],
 )
-def test_a_slave_is_killed_during_the_copy_of_the_memory_or_its_comparison(
+def test_a_slave_is_killed_during_the_copy_of_the_memory_or_the_comparison(
     criu, large, victim, moment
 ):
     """The node migrates with its whole memory, or stays, and no part of the copy is left."""

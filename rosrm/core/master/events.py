@@ -356,7 +356,7 @@ class OrderAnswered:
 
     @property
     def is_measurement(self) -> bool:
-        """Return True for the report of a host on its links, which decides nothing."""
+        """Return True if the order was a measurement of links; its answer causes no decision."""
         return isinstance(self.order, tuple) and self.order[0] == "links"
 
     @property

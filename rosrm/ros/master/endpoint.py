@@ -177,7 +177,7 @@ class MasterEndpoint:
 
 
 def _is_routine(event: happened.Event) -> bool:
-    """Return True for an event that decides nothing while no process is queued."""
+    """Return True if an event causes no decision while no process is queued."""
     if isinstance(event, happened.OrderAnswered):
         return event.is_measurement
     return isinstance(event, happened.ProcessRequested)

@@ -102,8 +102,8 @@ def _by_run(
     """Group rows by run, so that a former run's late messages do not hide the present run's.
 
     Returns:
-        The order of the rows by run of a slave, oldest first in each; in it, the first and the last
-        row of each run.
+        The order of the rows by run of a slave, oldest first in each. The positions in this order
+        of the first and of the last row of each run.
     """
     run = rows["host_id"].astype(np.uint64) << np.uint64(32)
     run |= rows["incarnation"] & np.uint64(0xFFFFFFFF)

@@ -12,7 +12,7 @@ from rosrm.core.master.scheduling.shortlist import WANTED, Shortlist
 
 values = st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0, 2.0, inf])
 changes = st.dictionaries(st.integers(0, 39), values, max_size=40)
-wanted_columns = st.integers(0, WANTED)  # 0: a change follows without a search
+wanted_columns = st.integers(0, WANTED)  # 0: no search before the next change
 
 
 @given(st.lists(values, max_size=40), st.lists(st.tuples(changes, wanted_columns), max_size=30))

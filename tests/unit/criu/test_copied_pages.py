@@ -1,4 +1,4 @@
-"""Pages of a dump that were copied before are left out, and are restored from the copy."""
+"""A dump leaves out pages that were copied before, and they are restored from the copy."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def copied_again(
 
 
 class Dump:
-    """CRIU that dumps to a page server.
+    """Substitute for a CRIU that dumps to a page server.
 
     Args:
         to: descriptor of the connection.
@@ -261,7 +261,7 @@ def test_an_unexpected_request_ends_the_connection_and_allows_another_dump(
 
 
 def test_a_full_disk_allows_another_dump(tmp_path, monkeypatch):
-    """The attempt may have filled it, and its files are removed first."""
+    """The first dump may have filled the disk, but its files are removed before the second."""
 
     def new_file(_: Path) -> BufferedWriter:
         return Path("/dev/full").open("wb")
@@ -279,7 +279,7 @@ def test_a_full_disk_allows_another_dump(tmp_path, monkeypatch):
 
 
 def test_a_process_that_outlives_criu_does_not_hold_up_the_dump(tmp_path):
-    """It has inherited CRIU's end of the connection, and the node is frozen."""
+    """The process has inherited CRIU's end of the connection. The node is frozen until the end."""
     timers = []
 
     def run(to: int) -> None:
@@ -295,7 +295,7 @@ def test_a_process_that_outlives_criu_does_not_hold_up_the_dump(tmp_path):
 
 
 def test_a_copy_of_another_size_allows_another_dump(tmp_path):
-    """Its pages cannot be assigned to their addresses."""
+    """The pages of such a copy cannot be assigned to their addresses."""
     copy = copied(tmp_path, FULL)
     with (copy.directory / file_name(PID)).open("ab") as file:
         file.write(content(0))
@@ -374,7 +374,7 @@ def test_the_memory_of_a_running_process_is_copied(tmp_path, holder):
 
 
 def test_an_area_that_is_listed_twice_is_copied_once(tmp_path, holder, monkeypatch):
-    """It grows while the kernel lists the areas; CRIU would restore its first copy of a page."""
+    """The area grows while the kernel lists it. CRIU would restore the first copy of a page."""
     begin = int(holder.stdout.readline())
     areas = ((begin, 1 << 19), (begin, 1 << 20), (begin + (1 << 18), 1 << 18))
     text = "".join(

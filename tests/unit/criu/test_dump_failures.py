@@ -73,7 +73,7 @@ def test_a_process_runs_on_before_its_useless_image_is_removed(
 
 @pytest.mark.parametrize("again", [True, False])
 def test_a_second_dump_has_the_rest_of_the_timeout(tmp_path, criu, process, monkeypatch, again):
-    """With less than half of the timeout it does not begin: a killed CRIU can harm the process."""
+    """With less than half of it, no second dump begins: a killed CRIU can harm the process."""
     seconds = 0.2 if again else 1.2
     timeouts: list[float] = []
 

@@ -198,8 +198,8 @@ def test_a_copy_that_is_undone_while_it_is_under_way_is_given_up(steps):
     assert not list((steps.folder / "images").iterdir())
 
 
-def test_a_move_that_is_undone_while_pages_are_received_dumps_no_second_time(steps, monkeypatch):
-    """The slave cannot receive them; the node rejoins instead."""
+def test_a_move_that_is_undone_while_pages_are_received_causes_no_second_dump(steps, monkeypatch):
+    """The slave cannot receive the pages; the node rejoins instead."""
     steps.until_offered()
     steps.fetch()
     steps.results[INTRODUCE] = {"copy": steps.received}

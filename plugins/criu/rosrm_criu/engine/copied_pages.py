@@ -1,8 +1,8 @@
-"""Pages of a dump that are equal in a `MemoryCopy` at the destination, and are restored from it.
+"""Comparison of the pages of a dump with a `MemoryCopy`, which becomes the parent of the image.
 
 CRIU's images may have a parent: an image of the same processes in the folder `parent`. A page that
-is marked as in the parent is restored from there. Here the parent is the copy, and pages are equal
-if all their bytes are, so the kernel need not track written pages.
+is marked as in the parent is restored from there. All bytes of the pages are compared, so the
+kernel need not track written pages.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Entry(NamedTuple):
 
     Attributes:
         page_range: the addresses of the pages.
-        flags: see `IN_PARENT`.
+        flags: see `IN_PARENT` and `PRESENT`.
     """
 
     page_range: PageRange
@@ -81,7 +81,7 @@ class CopiedPages:
 
     Args:
         copy: of all processes.
-        pid: of the process; one without a copy has no equal pages.
+        pid: of the process. Without a copy of it, no page is equal.
     """
 
     def __init__(self, copy: MemoryCopy, pid: int) -> None:
@@ -89,7 +89,7 @@ class CopiedPages:
         self._layers = list(_layers(copy, pid))
 
     def equal(self, address: int, pages: NDArray[np.uint64]) -> NDArray[np.bool_]:
-        """Return the mask of the dumped pages that are equal to the copied ones of their address.
+        """Return the mask of the dumped pages that equal the copied page of their address.
 
         Args:
             address: of the first page.
@@ -101,7 +101,7 @@ class CopiedPages:
         return equal
 
     def as_parent(self, directory: Path) -> dict[str, int]:
-        """Make the copy the parent of an image; return the bytes of its files by their paths."""
+        """Make the copy the parent of an image; return the size of each copied file by path."""
         for layer in self._layers:
             (directory / layer.folder).mkdir(mode=0o700, exist_ok=True)
             with new_file(directory / layer.folder / f"pagemap-{self._pid}.img") as file:
@@ -112,12 +112,13 @@ class CopiedPages:
 
 
 class _Layer:
-    """Copied pages of a process, as an image that is a parent.
+    """Copy of the pages of a process, in the form of a parent image.
 
     Args:
         folder: in the image.
         file: with the pages.
-        entries: the pages by ascending address; those that are not in the file are in the parent.
+        entries: the pages by ascending address; those that are not in the file are in the parent of
+            this image.
     """
 
     def __init__(self, folder: str, file: Path, entries: Sequence[Entry]) -> None:
@@ -131,7 +132,7 @@ class _Layer:
     def compare(
         self, dumped: PageRange, pages: NDArray[np.uint64], equal: NDArray[np.bool_]
     ) -> None:
-        """Mark those of the dumped pages whose addresses are copied here: equal or not."""
+        """Mark each dumped page with a copy here as equal or not; leave the other marks."""
         at = max(bisect_right(self._begins, dumped.begin) - 1, 0)
         while at < len(self._copied) and self._copied[at].begin < dumped.end:
             copied = self._copied[at]
@@ -157,7 +158,7 @@ def _layers(copy: MemoryCopy, pid: int) -> Iterator[_Layer]:
 
 
 def _split(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator[Entry]:
-    """Yield entries, split into pages that are in the parent and others."""
+    """Split entries like `split_entry`, with one mask for the pages of all."""
     row = 0
     for entry in entries:
         yield from split_entry(entry, same[row : row + entry.page_range.pages])
@@ -165,7 +166,7 @@ def _split(entries: Iterable[Entry], same: NDArray[np.bool_]) -> Iterator[Entry]
 
 
 def split_entry(entry: Entry, same: NDArray[np.bool_]) -> Iterator[Entry]:
-    """Yield an entry, split into pages that are in the parent (by this mask) and others."""
+    """Split an entry into ranges of pages that are in the parent, by the mask, and others."""
     (begin, pages), flags = entry
     edges = [0, *(np.flatnonzero(np.diff(same)) + 1).tolist(), pages]
     for first, after in pairwise(edges):

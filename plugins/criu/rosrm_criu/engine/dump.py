@@ -34,7 +34,8 @@ _FREEZE: Final = 10
 #: Seconds for a signal to stop or continue a process.
 _SIGNAL: Final = 5.0
 
-#: Function that runs a dump, given a page server's descriptor, and receives its pages.
+#: Function that receives the pages of a dump. Its arguments are a function that runs CRIU with the
+#: descriptor of a page server, and the directory of the image.
 Receive = Callable[[Callable[[int], None], Path], Mapping[str, int] | None]
 #: State of the process after the dump.
 Leave = Literal["stopped", "running", "killed"]
@@ -68,9 +69,9 @@ def dump(  # noqa: PLR0913 - two of them name the process
         instance: its number, for the manifest.
         checksums: add checksums of the files, which reads the image once more. Needed for an image
             that is stored on disk, but not for one that is sent to another host at once.
-        receive: receives the pages from CRIU, see `page_server.serve`. The manifest also has the
-            files that this function names, so add no checksums. If it cannot receive the pages, a
-            second dump begins, unless half of the timeout has passed.
+        receive: receives the pages from CRIU, see `page_server.serve`. The manifest also names the
+            files that this function returns. They are not in the image yet, so add no checksums. If
+            the function returns None, a second dump begins, unless half of the timeout has passed.
 
     Raises:
         CriuError: the process cannot be dumped, or the dump failed; the process runs as before.
@@ -132,7 +133,7 @@ def _run(
     criu: CriuBinary, root: int, directory: Path, timeout: float, process: str,
     receive: Receive | None,
 ) -> Mapping[str, int]:  # fmt: skip
-    """Run CRIU; return the bytes of the files that the image lacks, by path."""
+    """Run CRIU; return the size of each file that the image lacks, by path below it."""
     images = directory / image.PAGES
     arguments = (
         "dump", "--tree", str(inner_pid(root)), "--images-dir", str(images),
@@ -147,8 +148,8 @@ def _run(
         left = end - time.monotonic()
         if left < timeout / 2:  # CRIU would be killed before its end, which can harm the process
             raise CriuError(
-                "its pages could not be received, and less than half of the time-out of "
-                f"{timeout:g} s is left for another dump"
+                f"the pages of {process or f'pid {root}'} could not be received, and less than "
+                f"half of the time-out of {timeout:g} s is left for another dump"
             )
         log = directory / image.DUMP_LOG
         inside.run((*arguments, *more), timeout=left, log=log, pass_fds=pass_fds)
@@ -159,7 +160,7 @@ def _run(
     try:
         copied = receive(send_pages, directory) if receive else None
         if copied is None:
-            shutil.rmtree(images)  # files of an attempt to receive the pages
+            shutil.rmtree(images)  # has files if the pages could not all be received
             images.mkdir(mode=0o700)
             run()
     except CriuError as error:

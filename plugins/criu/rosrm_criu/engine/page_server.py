@@ -1,7 +1,7 @@
-"""Receiver of the pages that CRIU dumps; it leaves out those that are equal in a `MemoryCopy`.
+"""Receiver of the pages that CRIU dumps, which leaves out pages that equal a `MemoryCopy`.
 
 CRIU can send pages to a *page server* instead of writing them to files. Here the slave is the page
-server: it compares each page with the copy while CRIU reads the next ones. So no file contains the
+server: it compares pages with the copy while CRIU reads the next ones. So no file contains the
 whole memory. The connection is a socket pair that CRIU inherits, so no other process can use it.
 """
 
@@ -30,14 +30,14 @@ from rosrm_criu.engine.memory_copy import PAGE, MemoryCopy, PageRange
 
 #: Request of CRIU: command and flags, number of pages, address, and the image's kind and id.
 _REQUEST: Final = struct.Struct("IQQQ")
-#: Commands: begin an image; receive pages; "does it have a parent?"; end of the dump, in two forms.
+#: Commands: begin an image, receive pages, report if it has a parent, end the dump (two forms).
 _OPEN, _ADD, _HAS_PARENT, _END = 4, 6, 5, (0x1023, 0x1024)
-#: Answers: the image has no parent (so CRIU sends all pages); no, and everything is written.
+#: Answers: to `_OPEN`, no parent, so CRIU sends all pages; to `_HAS_PARENT`, no; to `_END`, done.
 _NO_PARENT, _ZERO = b"\0", struct.pack("i", 0)
 #: Names of pagemaps by the kind of the image: of a process, of shared memory.
 _NAMES: Final = {1: "pagemap-{}.img", 2: "pagemap-shmem-{}.img"}
 _OF_PROCESS: Final = 1
-#: Flags of pages: PE_PRESENT (their content follows), PE_LAZY (as CRIU may restore them).
+#: Flags of pages: PE_PRESENT (their content follows), also with PE_LAZY (restored on first use).
 _FLAGS: Final = (4, 4 | 2)
 #: Pages that are received at once, so that they stay in the processor's cache.
 _AT_ONCE: Final = 256
@@ -65,11 +65,11 @@ def serve(run: Callable[[int], None], directory: Path, copy: MemoryCopy) -> dict
             with theirs:
                 try:
                     run(theirs.fileno())
-                finally:  # ends the receiver, even if a process that CRIU has left has this end too
+                finally:  # ends the receiver, even if a process that CRIU left still has this end
                     theirs.shutdown(socket.SHUT_RDWR)
         except CriuError:
             if isinstance(received.exception(), EOFError | ConnectionError | None):
-                raise
+                raise  # CRIU itself failed, not the receiver
         return received.result() if received.exception() is None else None
 
 

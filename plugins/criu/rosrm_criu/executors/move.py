@@ -154,7 +154,7 @@ def end(arguments: Answer) -> Answer:
 
 
 def _dump(pid: int, asked: StepArguments) -> tuple[Path, str]:
-    """Return the directory of the image, and the name of this part of the move."""
+    """Dump the process; return the directory of the image, and the name of this part."""
     directory = outgoing(asked.state, asked.source)
     artifacts.discard(directory)
     attempts.check_wanted(asked.attempt)

@@ -81,7 +81,7 @@ class Moment:
 
     Attributes:
         judges: the scoring policies that decided.
-        failure: why policies were left out.
+        failure: why policies were left out; "": none was.
         hosts: with copies of all that assignments change.
         value: score plus tie-break of each host; inf where the host did not fit.
         standing: for each host the first failed filter that assignments do not change.

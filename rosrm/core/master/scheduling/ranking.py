@@ -299,7 +299,7 @@ class Ranking:
         self._ahead.clear()
 
     def _preferred(self) -> Shortlist:
-        """Return the shortlist of the best tier of labels among fitting hosts."""
+        """Return the shortlist of all hosts, or of those in the best tier of labels that fits."""
         if self._best_tier is None:
             self._best_tier, tier = self._shortlist, self._tier
             if tier is not None and (fitting := self.value < np.inf).any():

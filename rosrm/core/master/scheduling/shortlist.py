@@ -14,9 +14,9 @@ from rosrm.core.master.state.host_arrays import FloatArray
 WANTED: Final = 4
 #: Number of columns that a search finds after single values have changed, to need fewer searches.
 _AHEAD: Final = 8
-#: Number of changed values above which a new search costs less; the list has no more columns.
+#: Number of changed values above which a new search costs less; also the longest list.
 MOST: Final = 12
-#: Sort before and after each finite value.
+#: `_ALL` sorts before each finite value, `_NONE` after each.
 _ALL: Final = (-inf, -1)
 _NONE: Final = (inf, -1)
 
@@ -36,10 +36,10 @@ class Shortlist:
         self._finite: int | None = None
         self._lowest: list[tuple[float, int]] = []
         self._end = _ALL  # each finite value that is not in the list comes after this one
-        self._changed = False
+        self._changed = False  # after a change, a search finds more columns than are wanted
 
     def lowest(self, wanted: int = WANTED) -> list[int]:
-        """Return the columns with the lowest values, in order; fewer only if no more are finite."""
+        """Return `wanted` columns with the lowest values, in order; fewer if no more are finite."""
         if len(self._lowest) < wanted and self._end is not _NONE:
             self._search(_AHEAD if self._changed else wanted)
         return [column for _, column in self._lowest[:wanted]]
