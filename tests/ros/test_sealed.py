@@ -34,11 +34,12 @@ class Stage:
         names = ("rosrm_master", "rosrm_client", "stranger")
         self.parts = [Participant(RosSettings(domain=domain), name) for name in names]
         self.master, self.command, self.stranger = self.parts
-        self.refused: list[str] = []
+        self.refused: list[str] = []  # by the master
+        self.refused_answers: list[str] = []  # by the user
         self.ada = MemberSecurity(ADA)
         self.cluster = MasterSecurity(SECRET)
         self.server = SealedEndpoints(self.master, self.cluster, self.refused.append)
-        self.user = SealedEndpoints(self.command, self.ada, self.refused.append)
+        self.user = SealedEndpoints(self.command, self.ada, self.refused_answers.append)
         self.asked: list[tuple[str, str]] = []
         self.raises = False
 
@@ -118,7 +119,7 @@ def test_a_forged_answer_of_a_second_server_is_dropped(stage: Stage) -> None:
     wait_until(lambda: len(recorded) > 20, "the stranger to see the requests", pause=stage.spin)
     # A shorter word is in random bytes by chance.
     assert not any(b"patrol_" in bytes(message.body) for message in recorded)
-    assert SERVICE in stage.refused
+    assert SERVICE in stage.refused_answers
 
 
 def test_a_stranger_is_not_answered(stage: Stage) -> None:
@@ -132,16 +133,18 @@ def test_a_stranger_is_not_answered(stage: Stage) -> None:
     unknown = stage.forged(os.urandom(50))
     unknown.principal = "host:\x1b[2J"
     changed = stage.forged(bytes(recorded[0].body), recorded[0].counter + 1)
-    client = stage.stranger.node.create_client(srv.Sealed, SERVICE, qos_profile=qos.SERVICE)
-    graph = stage.stranger.node
-    wait_until(client.service_is_ready, "the stranger to find the service", pause=stage.spin)
+    stranger, master = stage.stranger.node, stage.master.node
+    client = stranger.create_client(srv.Sealed, SERVICE, qos_profile=qos.SERVICE)
     wait_until(
-        lambda: "rosrm_master" in graph.get_node_names(), "the master to be found", pause=stage.spin
-    )
-    stage.refused.clear()
+        lambda: (stranger.count_services(SERVICE), master.count_clients(SERVICE)) == (2, 2),
+        "stranger and master to discover each other", pause=stage.spin,
+    )  # fmt: skip
     for message in (recorded[0], stage.forged(b""), stage.forged(os.urandom(50)), unknown, changed):
         client.call_async(srv.Sealed.Request(message=message))
-    wait_until(lambda: len(stage.refused) == 5, "five refusals", pause=stage.spin)
+    wait_until(
+        lambda: len(stage.refused) == 5, "five refusals",
+        seen=lambda: stage.refused, pause=stage.spin,
+    )  # fmt: skip
     assert stage.asked == []
 
 
