@@ -71,47 +71,59 @@ while True:
 """
 
 
+@pytest.fixture
+def changer(theatre):
+    """Return a process that changes its memory and prints its checksum."""
+    actor = theatre.start(CHANGER)
+    actor.says("ready")
+    return actor
+
+
+def print_checksum(changer, pid):
+    """Let the process, original or restored, print the checksum of its memory."""
+    os.kill(pid, signal.SIGUSR2)
+    eventually(changer.numbers, "a checksum")
+
+
+def check_restored_memory(theatre, changer, directory):
+    """Restore the process, whose checksum is printed, and compare both checksums."""
+    restored = theatre.restore(directory)
+    print_checksum(restored, restored.outcome.pid)
+    assert restored.numbers() == changer.numbers()
+
+
 # --- what continues -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("again", [False, True])
 @pytest.mark.parametrize("changes", [0, 1])
-def test_a_process_is_restored_from_a_copy_and_its_later_changes(theatre, again, changes):
+def test_a_process_is_restored_from_a_copy_and_its_later_changes(theatre, changer, again, changes):
     """CRIU reads pages that were equal in the dump from the copies, which were made before.
 
     What has changed since the first copy is copied again, or left to the dump. The second change
     is back to the first content.
     """
-    actor = theatre.start(CHANGER)
-    actor.says("ready")
-    copy = memory_copy.copy([actor.pid], theatre.folder / "copy", lambda: None)
-    os.kill(actor.pid, signal.SIGUSR1)
-    eventually(lambda: actor.lines().count("changed\n") == 1, "a change")
+    copy = memory_copy.copy([changer.pid], theatre.folder / "copy", lambda: None)
+    os.kill(changer.pid, signal.SIGUSR1)
+    eventually(lambda: changer.lines().count("changed\n") == 1, "a change")
     if again:
-        copy = memory_copy.copy_changes(copy, [actor.pid], lambda: None)
+        copy = memory_copy.copy_changes(copy, [changer.pid], lambda: None)
         assert (copy.directory / "changes").exists()
     if changes:
-        os.kill(actor.pid, signal.SIGUSR1)
-        eventually(lambda: actor.lines().count("changed\n") == 2, "another change")
-    os.kill(actor.pid, signal.SIGUSR2)
-    eventually(actor.numbers, "a checksum")
-    directory = theatre.dump(actor, copy=copy)
+        os.kill(changer.pid, signal.SIGUSR1)
+        eventually(lambda: changer.lines().count("changed\n") == 2, "another change")
+    print_checksum(changer, changer.pid)
+    directory = theatre.dump(changer, copy=copy)
     changed = image.file_sizes(directory)
     assert sum(size for name, size in changed.items() if "/pages-" in name) < 3_000_000
     copied_pages.move_into_parent(directory, copy.directory)
-    restored = theatre.restore(directory)
-    os.kill(restored.outcome.pid, signal.SIGUSR2)
-    eventually(restored.numbers, "a checksum")
-    assert restored.numbers() == actor.numbers()
+    check_restored_memory(theatre, changer, directory)
 
 
-def test_a_process_is_dumped_whole_if_its_pages_cannot_be_compared(theatre, monkeypatch):
+def test_a_process_is_dumped_whole_if_its_pages_cannot_be_compared(theatre, changer, monkeypatch):
     """CRIU's first dump fails in the middle, and the second one has the whole memory."""
-    actor = theatre.start(CHANGER)
-    actor.says("ready")
-    copy = memory_copy.copy([actor.pid], theatre.folder / "copy", lambda: None)
-    os.kill(actor.pid, signal.SIGUSR2)
-    eventually(actor.numbers, "a checksum")
+    copy = memory_copy.copy([changer.pid], theatre.folder / "copy", lambda: None)
+    print_checksum(changer, changer.pid)
     compare, calls = CopiedPages.equal, []
 
     def fail(*arguments):
@@ -121,14 +133,11 @@ def test_a_process_is_dumped_whole_if_its_pages_cannot_be_compared(theatre, monk
         return compare(*arguments)
 
     monkeypatch.setattr(CopiedPages, "equal", fail)
-    directory = theatre.dump(actor, copy=copy)
+    directory = theatre.dump(changer, copy=copy)
     assert len(calls) == 31
     assert theatre.manifest.sizes == image.file_sizes(directory)
     assert not (directory / image.PARENT).exists()
-    restored = theatre.restore(directory)
-    os.kill(restored.outcome.pid, signal.SIGUSR2)
-    eventually(restored.numbers, "a checksum")
-    assert restored.numbers() == actor.numbers()
+    check_restored_memory(theatre, changer, directory)
 
 
 def test_a_restored_process_continues_and_logs_into_the_new_file(theatre, counter):

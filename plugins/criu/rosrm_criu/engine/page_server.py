@@ -19,6 +19,7 @@ import numpy as np
 from rosrm.errors import CriuError
 from rosrm_criu.engine.copied_pages import (
     IN_PARENT,
+    PRESENT,
     CopiedPages,
     Entry,
     encoded,
@@ -37,8 +38,9 @@ _NO_PARENT, _ZERO = b"\0", struct.pack("i", 0)
 #: Names of pagemaps by the kind of the image: of a process, of shared memory.
 _NAMES: Final = {1: "pagemap-{}.img", 2: "pagemap-shmem-{}.img"}
 _OF_PROCESS: Final = 1
-#: Flags of pages: PE_PRESENT (their content follows), also with PE_LAZY (restored on first use).
-_FLAGS: Final = (4, 4 | 2)
+#: Flags of pages: their content follows, also with PE_LAZY (restored on first use).
+_LAZY: Final = 2
+_FLAGS: Final = (PRESENT, PRESENT | _LAZY)
 #: Pages that are received at once, so that they stay in the processor's cache.
 _AT_ONCE: Final = 256
 
