@@ -166,7 +166,7 @@ def test_what_failed_last_is_run_alone(run_tests):
 
 
 def test_a_test_beside_another_run_has_more_time(run_tests, tmp_path):
-    """It has less priority: on a busy machine a sound test took longer than the usual limit."""
+    """On a busy machine, a sound test with less priority took longer than the usual limit."""
     with (tmp_path / "pytest.ini").open("a") as ini:
         ini.write("timeout = 120\n")
     limit = "def test_limit(pytestconfig): assert float(pytestconfig.getini('timeout')) == {}\n"
