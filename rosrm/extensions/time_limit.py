@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable
 from types import FrameType
-from typing import Any, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from rosrm.errors import place_in_stack
 
@@ -45,20 +45,30 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
     if threading.current_thread() is not threading.main_thread():
         return call()
     alarm = _Alarm(inspect.currentframe())
+    outer, _Alarm.ringing = _Alarm.ringing, alarm
     # A process has one timer, so that of a test runner or of an outer limit is restored afterwards.
-    before = signal.signal(signal.SIGALRM, alarm.ring)
+    before = signal.signal(signal.SIGALRM, _ring)
     left, interval = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
     try:
         return call()
     finally:
         alarm.stop()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
-        if left:
+        _Alarm.ringing = outer
+        # The default action stays replaced, because a last alarm on its way would end the process.
+        if callable(before) and before is not _ring:
             signal.signal(signal.SIGALRM, before)
+        if left:
             signal.setitimer(signal.ITIMER_REAL, left, interval)
         if alarm.interrupt is not None:
             # The traceback has the place in the plugin at which the call was interrupted.
             raise TimeoutError(late()).with_traceback(alarm.interrupt.__traceback__) from None
+
+
+def _ring(number: int, frame: FrameType | None) -> None:
+    """Pass the alarm on; the handler stays installed, so it must keep no call and no frame."""
+    if _Alarm.ringing is not None:
+        _Alarm.ringing.ring(number, frame)
 
 
 def _is_own(frame: FrameType | None) -> bool:
@@ -76,8 +86,11 @@ class _Alarm:
         guard: the frame that executes the call; it is not interrupted itself.
 
     Attributes:
+        ringing: that of the innermost running call.
         interrupt: the newest interrupt; None if the call ended in time.
     """
+
+    ringing: ClassVar[_Alarm | None] = None
 
     def __init__(self, guard: FrameType | None) -> None:
         self.interrupt: _Interrupt | None = None
@@ -88,7 +101,7 @@ class _Alarm:
 
     def stop(self) -> None:
         """Interrupt nothing from now on."""
-        self._running = False
+        self._running, self._guard = False, None  # the frame refers to this object
         if self.interrupt is not None:
             sys.settrace(self._before[0])
             sys.setprofile(self._before[1])
