@@ -73,20 +73,36 @@ def applies_to(nodes: str, name: str) -> bool:
     return re.fullmatch(expression, name) is not None
 
 
-def merged_parameters(sources: Iterable[ParameterSource], name: str) -> dict[str, dict[str, Any]]:
-    """Return parameters by pattern of nodes, later sources over earlier ones.
+def merged_parameters(
+    sources: Iterable[ParameterSource], name: str = "", started: str = ""
+) -> dict[str, dict[str, Any]]:
+    """Return the parameters of a process by pattern of nodes, as one file instead of several.
+
+    Each section remains, because a program may have several nodes. As in ROS, a repeated section
+    is at its first place, with its last values. The last section is that of the node of the
+    process: it has all that applies to this node, because rclpy knows no pattern but `ALL_NODES`.
 
     Args:
-        sources: without files.
-        name: fully qualified name of the only node: it gets all that applies to it, under
-            `ALL_NODES`. "": unknown; each pattern remains.
+        sources: with `file`: a section of that file, in which a full name overrides patterns;
+            without: an entry of the user, which overrides everything before it.
+        name: fully qualified name of the node of the process; "": unknown.
+        started: its full name in this run, such as the alias of a handoff.
     """
     merged: dict[str, dict[str, Any]] = {}
+    by_pattern: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for source in sources:
-        if not name:
-            # ROS applies sections in their order, and a repeated one at its first place.
-            own = {**merged.pop(source.nodes, {}), **source.parameters}
-            merged[source.nodes] = own
-        elif applies_to(source.nodes, name):
-            merged.setdefault(ALL_NODES, {}).update(source.parameters)
+        merged.setdefault(source.nodes, {}).update(source.parameters)
+        if source.nodes == name:
+            by_name.update(source.parameters)
+        elif name and applies_to(source.nodes, name):
+            by_pattern.update(source.parameters)
+            if not source.file:
+                by_name = {
+                    key: value for key, value in by_name.items() if key not in source.parameters
+                }
+    own = {**by_pattern, **by_name}
+    merged.pop(name, None)
+    if own != merged.get(ALL_NODES, {}):
+        merged[started or name] = own
     return {nodes: parameters for nodes, parameters in merged.items() if parameters}

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 
 import pytest
 
 from rosrm.config.work import checked_work
+from rosrm.extensions.registry import Registry
 from rosrm_launch.beside import completed
-from rosrm_launch.model import LaunchModel
+from rosrm_launch.model import LaunchModel, Parameters, Process
 from rosrm_launch.translate import translated
 from tests.launch_files import make_package, stored
-from tests.ros.clusters import NODE, host
+from tests.ros.clusters import NODE, SPIN, host
 
 #: The node of these files, which is a lifecycle node where a file makes its transitions.
 LIFECYCLE_NODE = NODE.replace(
@@ -46,9 +48,73 @@ def target_of(name: str, beside: Path | None = None):
     return checked_work(work, path, None)
 
 
+#: A program with three nodes, of which the last two have names of their own, as in Nav2.
+SEVERAL_NODES = (
+    """
+import json, rclpy
+from rclpy.node import Node
+rclpy.init()
+own = [[], *(["--ros-args", "-r", f"__node:={name}", "-r", f"__ns:={namespace}"]
+       for name, namespace in (("costmap", "/costmap"), ("helper", "/")))]
+nodes = [
+    Node("x", cli_args=words, automatically_declare_parameters_from_overrides=True) for words in own
+]
+node = nodes[0]
+print(json.dumps({
+    one.get_fully_qualified_name(): {
+        name: one.get_parameter(name).value for name in one._parameters
+        if not name.startswith(("use_sim", "start_"))
+    }
+    for one in nodes
+}), flush=True)
+"""
+    + SPIN
+)
+#: What launch gives such a program: files, and a dictionary between them.
+SECTIONS = [
+    Parameters(values={"frame": "map", "plugins": ["a", "b"]}),
+    Parameters(nodes="/controller", values={"rate": 20.0, "goal.x": 1.0}),
+    Parameters(nodes="/costmap/costmap", values={"width": 3, "frame": "odom"}),
+    Parameters(nodes="/controller", values={"rate": 30.0}),
+    Parameters(nodes="/costmap/costmap", values={"width": 4}),
+    Parameters(values={"plugins": ["c"]}),
+]
+
+
+def test_each_node_of_a_process_gets_its_section_on_every_host(cluster, tmp_path) -> None:
+    """By its full name, and by `/**`, in the order of the files, also after a move."""
+    program = tmp_path / "several.py"
+    program.write_text(SEVERAL_NODES)
+    process = Process(
+        number=0, kind="node", file="nav.launch.py", name="controller",
+        command=[sys.executable, str(program)], parameters=SECTIONS,
+    )  # fmt: skip
+    beside = tmp_path / "nav.rosrm.yaml"
+    beside.write_text("nodes: {controller: {migration: relaunch}}\n")
+    path = Path("/robot/nav.launch.py")
+    model = LaunchModel(file=str(path), processes=[process])
+    target = checked_work(completed(translated(model), path, beside), path, Registry.discover())
+    cluster.client.apply([target])
+    first = cluster.wait("controller", "running").host
+    expected = {
+        "/controller": {"frame": "map", "plugins": ["c"], "rate": 30.0, "goal.x": 1.0},
+        "/costmap/costmap": {"frame": "odom", "plugins": ["c"], "width": 4},
+        "/helper": {"frame": "map", "plugins": ["c"]},
+    }
+    assert json.loads(line_of(cluster, "controller")) == expected
+    cluster.client.migrate("controller", None)
+    cluster.wait("controller", "running", where=lambda row: row.host != first)
+    assert json.loads(line_of(cluster, "controller")) == expected
+    remove(cluster, target)
+
+
+def line_of(cluster, name: str) -> str:
+    cluster.wait_for_log(name, "}\n")
+    return next(line for line in cluster.log(name).splitlines() if line.startswith("{"))
+
+
 def said(cluster, name: str) -> dict:
-    log = cluster.wait_for_log(name, '"topic"')
-    return json.loads(next(line for line in log.splitlines() if line.startswith("{")))
+    return json.loads(line_of(cluster, name))
 
 
 def remove(cluster, target) -> None:

@@ -170,7 +170,7 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
 
     None: there are no parameters.
     """
-    text = parameters_text(all_parameters(assignment.spec, assignment.spec.node))
+    text = parameters_text(all_parameters(assignment.spec, assignment.node_name))
     if not text:
         return None
     path = log_path(state_directory, assignment.instance).with_suffix(".parameters.yaml")

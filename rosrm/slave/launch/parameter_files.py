@@ -1,8 +1,9 @@
-"""Sources of ROS parameters on a host: files are read, and the sections of its node are kept."""
+"""Sources of ROS parameters on a host, whose files are read there."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -15,16 +16,16 @@ from rosrm.model.values import ParameterSource, ProcessSpec, qualified_name
 _LARGEST: Final = 1 << 24
 
 
-def all_parameters(spec: ProcessSpec, node_name: str) -> dict[str, dict[str, Any]]:
+def all_parameters(spec: ProcessSpec, started: str = "") -> dict[str, dict[str, Any]]:
     """Return the parameters of a process by pattern of nodes, read on this host.
 
-    `node_name`: visible name of its node; "": unknown.
+    `started`: name with which its node is started; "": its own.
 
     Raises:
         LaunchError: a file cannot be read, or is no parameters file.
     """
-    name = qualified_name(spec.namespace, node_name) if node_name else ""
-    return merged_parameters(_contents(spec), name)
+    names = (name and qualified_name(spec.namespace, name) for name in (spec.node, started))
+    return merged_parameters(_contents(spec), *names)
 
 
 def _contents(spec: ProcessSpec) -> Iterator[ParameterSource]:
@@ -34,7 +35,8 @@ def _contents(spec: ProcessSpec) -> Iterator[ParameterSource]:
             yield source
             continue
         try:
-            yield from parse_parameters(_read(Path(source.file).expanduser()))
+            for section in parse_parameters(_read(Path(source.file).expanduser())):
+                yield replace(section, file=source.file)
         except (OSError, RuntimeError, ValueError) as error:
             why = getattr(error, "strerror", None) or str(error)
             raise LaunchError(f"parameters file {source.file!r}: {why}") from None

@@ -74,8 +74,8 @@ def test_the_parameters_of_a_mode_override_a_list_of_parameters(file, tmp_path) 
         )
     )
     ((planner,),) = (target.specs for target in mode.targets)
-    found = all_parameters(planner, "planner")
-    assert found == {"/**": {"speed": 0.5, "frame.id": "odom", "rate": 5}}
+    found = all_parameters(planner)["/nav/planner"]
+    assert found == {"speed": 0.5, "frame.id": "odom", "rate": 5}
 
 
 @pytest.mark.parametrize(

@@ -53,23 +53,46 @@ def test_a_pattern_stands_for_parts_of_names(nodes, name, applies):
     assert not pattern_fault(nodes)
 
 
-def test_the_last_source_that_applies_counts():
-    """The order decides, not how exact a pattern is; what does not apply is left out."""
-    sources = [
-        ParameterSource(nodes="/robot/planner", parameters={"a": 1, "b": 1}),
-        ParameterSource(nodes="/other", parameters={"a": 2}),
-        ParameterSource(nodes="/**", parameters={"b": 3}),
-    ]
-    assert merged_parameters(sources, "/robot/planner") == {"/**": {"a": 1, "b": 3}}
+OWN = "/robot/planner"
 
 
-def test_without_a_name_each_pattern_remains():
-    """A program may have several nodes. A repeated pattern applies at its last place."""
+def test_every_section_remains_for_the_other_nodes_of_a_process():
+    """A repeated section is at its first place with its last values, as in ROS."""
     sources = [
         ParameterSource(nodes="/a", parameters={"x": 1, "y": 1}),
         ParameterSource(nodes="/**", parameters={"x": 2}),
         ParameterSource(nodes="/a", parameters={"x": 3}),
         ParameterSource(nodes="/empty"),
     ]
-    merged = merged_parameters(sources, "")
-    assert list(merged.items()) == [("/**", {"x": 2}), ("/a", {"x": 3, "y": 1})]
+    expected = [("/a", {"x": 3, "y": 1}), ("/**", {"x": 2})]
+    assert list(merged_parameters(sources).items()) == expected
+    assert list(merged_parameters(sources, OWN).items()) == expected
+
+
+def test_the_section_of_its_own_node_is_the_last_and_has_all_that_applies():
+    """An alias has that of the node's own name; rclpy knows no pattern but `/**`."""
+    sources = [
+        ParameterSource(nodes=OWN, parameters={"a": 1}),
+        ParameterSource(nodes="/other", parameters={"a": 2}),
+        ParameterSource(nodes="/robot/*", parameters={"b": 3}),
+    ]
+    others = [("/other", {"a": 2}), ("/robot/*", {"b": 3})]
+    own = {"a": 1, "b": 3}
+    assert list(merged_parameters(sources, OWN).items()) == [*others, (OWN, own)]
+    aliased = merged_parameters(sources, OWN, "/robot/alias")
+    assert list(aliased.items()) == [*others, ("/robot/alias", own)]
+
+
+@pytest.mark.parametrize(("file", "value"), [("p.yaml", 1), ("", 2)])
+def test_a_full_name_in_a_file_overrides_patterns_but_no_later_entry_of_the_user(file, value):
+    """Files are read as by ROS; each entry of a list overrides those before it."""
+    sources = [
+        ParameterSource("p.yaml", OWN, {"a": 1}), ParameterSource(file, "/**", {"a": 2}),
+    ]  # fmt: skip
+    assert merged_parameters(sources, OWN).get(OWN, {"a": 2}) == {"a": value}
+
+
+def test_parameters_of_all_nodes_need_no_section_of_its_own():
+    """The file stays as short as its source."""
+    sources = [ParameterSource(parameters={"a": 1}), ParameterSource(parameters={"b": 1})]
+    assert merged_parameters(sources, OWN) == {"/**": {"a": 1, "b": 1}}

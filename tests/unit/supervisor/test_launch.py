@@ -309,7 +309,7 @@ def test_parameters_go_to_a_file_beside_the_log(tmp_path):
 
 
 def test_sources_of_parameters_are_merged_in_their_order(tmp_path):
-    """Files are read on the host; sections of other nodes are left out, for an alias as well."""
+    """Files are read on the host; other nodes keep their sections, and an alias has its own."""
     file = tmp_path / "params.yaml"
     file.write_text(
         "/**: {ros__parameters: {rate: 2, tolerance: 1e-3, on: true}}\n"
@@ -324,8 +324,12 @@ def test_sources_of_parameters_are_merged_in_their_order(tmp_path):
     spec = replace(given.spec, parameter_sources=sources)
     launched(tmp_path, replace(given, spec=spec))
     (made,) = (tmp_path / "logs").glob("*.yaml")
-    expected = {"rate": 3, "first": "a", "tolerance": 0.001, "on": False}
-    assert yaml.safe_load(made.read_text()) == {"/**": {"ros__parameters": expected}}
+    sections = yaml.safe_load(made.read_text())
+    assert list(sections) == ["/**", "/robot/other", "/robot/*", "/robot/talker_1700000000"]
+    found = {nodes: section["ros__parameters"] for nodes, section in sections.items()}
+    assert found["/**"] == {"rate": 2, "first": "a", "tolerance": 0.001, "on": True}
+    assert found["/robot/other"] == {"rate": 4}
+    assert found["/robot/talker_1700000000"] == {**found["/**"], "rate": 3, "on": False}
 
 
 def test_nodes_that_keep_their_names_get_no_name(tmp_path):

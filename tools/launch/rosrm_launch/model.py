@@ -33,7 +33,11 @@ class Wait(_Part):
 
 
 class Component(_Part):
-    """Component that a container loads; parameters as in `Parameters.values`."""
+    """Component that a container loads; parameters as in `Parameters.values`.
+
+    Attributes:
+        sections: full names of all nodes in its parameter files.
+    """
 
     package: str
     plugin: str
@@ -42,6 +46,7 @@ class Component(_Part):
     parameters: dict[str, Any] = {}
     remappings: list[tuple[str, str]] = []
     arguments: dict[str, Any] = {}
+    sections: list[str] = []
 
 
 class Process(_Part):

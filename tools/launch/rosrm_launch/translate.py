@@ -12,7 +12,7 @@ from typing import Any, Final
 from rosrm.errors import ConfigError
 from rosrm.model.description_checks import is_node_name
 from rosrm.model.parameters import SECTION, merged_parameters
-from rosrm.model.values import KEEP_NAME, ParameterSource, qualified_name
+from rosrm.model.values import ALL_NODES, KEEP_NAME, ParameterSource, qualified_name
 from rosrm.wording import listed
 from rosrm_launch.model import Component, LaunchModel, Load, Omission, Process
 from rosrm_launch.package_paths import PackagePaths
@@ -144,7 +144,25 @@ class _Translator:
                 self._omit(at, title, "it has no name, by which its host could find it again")
             else:
                 found.setdefault(container, []).append(self._component(part))
+        self._note_sections(parts)
         return found
+
+    def _note_sections(self, parts: Sequence[tuple[Process | Load, str, Component]]) -> None:
+        """Note sections of components' files that no node can get: a request has none of them."""
+        nodes = {_node_of(one) for one in self._started}
+        nodes |= {qualified_name(part.namespace, part.name) for _, _, part in parts}
+        of_containers = {
+            _node_of(one): {given.nodes for given in one.parameters} for one in self._started
+        }
+        for at, container, part in parts:
+            lacking = set(part.sections) - nodes - of_containers.get(container, set())
+            if lacking:
+                self._notes.append(
+                    f"{at.file}: the parameter files of the component {part.name or part.plugin} "
+                    f"have sections for {listed(sorted(lacking))}. If the component makes such "
+                    f"nodes, give the files to {container} too: as in launch, its nodes get only "
+                    "the parameters of the container"
+                )
 
     def _component(self, part: Component) -> dict[str, Any]:
         entry = {
@@ -209,16 +227,16 @@ class _Translator:
         return entry
 
     def _parameters(self, one: Process) -> Any:
-        """Return the parameters that apply to the node; all sections if its name is not known."""
+        """Return all sections that launch gives the process, whose program may have many nodes."""
         sources = [
             ParameterSource(nodes=given.nodes, parameters=self._values(one, given.values))
             for given in one.parameters
         ]
         # As launch_ros says: those of a full name override those of a pattern, in any order.
         sources.sort(key=lambda source: "*" not in source.nodes)
-        merged = merged_parameters(sources, _node_of(one))
-        if one.name:
-            return next(iter(merged.values()), {})
+        merged = merged_parameters(sources)
+        if merged.keys() <= {ALL_NODES}:
+            return merged.get(ALL_NODES, {})
         return [{nodes: {SECTION: values}} for nodes, values in merged.items()]
 
     def _values(self, one: Process, values: Mapping[str, Any]) -> dict[str, Any]:

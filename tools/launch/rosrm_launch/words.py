@@ -11,6 +11,7 @@ from typing import Final
 import yaml
 
 from rosrm.config.parameter_files import parse_parameters
+from rosrm.model.values import ALL_NODES
 from rosrm_launch.model import Parameters, Process
 
 #: Directories of the operating system, which every host has.
@@ -37,19 +38,23 @@ class RosArguments:
                     self.remappings.append((source, target))
             elif word == "-p":
                 name, _, text = left.popleft().partition(":=")
-                self.parameters.append(Parameters(values={name: yaml.safe_load(text)}))
+                node, _, name = name.rpartition(":")
+                nodes = f"/{node.strip('/')}" if node else ALL_NODES
+                self.parameters.append(Parameters(nodes=nodes, values={name: yaml.safe_load(text)}))
             elif word == "--params-file":
-                self._read(Path(left.popleft()))
+                self.parameters += sections_in(Path(left.popleft()))
             else:
                 self.others.append(word)
         if self.others:
             self.others.insert(0, "--ros-args")
 
-    def _read(self, path: Path) -> None:
-        try:
-            self.parameters += _sections(path.read_text())
-        except ValueError as error:
-            raise ValueError(f"parameters file {path}: {error}") from None
+
+def sections_in(path: Path) -> tuple[Parameters, ...]:
+    """Return the sections of a parameters file; raises `ValueError` if it is none."""
+    try:
+        return _sections(path.read_text())
+    except ValueError as error:
+        raise ValueError(f"parameters file {path}: {error}") from None
 
 
 @cache

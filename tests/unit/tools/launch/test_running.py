@@ -56,6 +56,29 @@ def test_the_stored_models_are_those_of_launch(tmp_path, name):
 
 
 @needs_launch
+def test_the_whole_of_a_parameters_file_is_in_the_model(file, tmp_path):
+    """A process gets each section; of a component the names are kept, for a note."""
+    parameters = tmp_path / "p.yaml"
+    parameters.write_text(
+        "/a: {ros__parameters: {x: 1}}\nb: {b: {ros__parameters: {y: 2}}}\n"
+        "/**: {ros__parameters: {z: 3}}\n"
+    )
+    body = (
+        "from launch_ros.actions import ComposableNodeContainer as C\n"
+        "from launch_ros.descriptions import ComposableNode as D\n"
+        f"files = [{str(parameters)!r}, {{'x': 4}}]\n"
+        "part = D(package='p', plugin='q', name='a', parameters=files)\n"
+        "return L([C(package='std_msgs', executable='e', name='box', namespace='/',\n"
+        "    parameters=files, composable_node_descriptions=[part])])"
+    )
+    (box,) = resolve(file(body), [], timeout=30.0).processes
+    given = [(one.nodes, one.values) for one in box.parameters]
+    assert given == [("/a", {"x": 1}), ("/b/b", {"y": 2}), ("/**", {"z": 3}), ("/box", {"x": 4})]
+    (part,) = box.components
+    assert (part.parameters, part.sections) == ({"x": 4, "z": 3}, ["/a", "/b/b"])
+
+
+@needs_launch
 def test_nothing_is_started(file, tmp_path):
     """Commands are only recorded, also those that an event would start."""
     marker = tmp_path / "started"

@@ -8,7 +8,15 @@ import pytest
 
 from rosrm.config.work import checked_work
 from rosrm.errors import ConfigError
-from rosrm.model.values import GroupMembership, Kind, RestartPolicy, StartOrder, StopPolicy
+from rosrm.model.values import (
+    GroupMembership,
+    Kind,
+    RestartPolicy,
+    StartOrder,
+    StopPolicy,
+    qualified_name,
+)
+from rosrm.slave.launch.parameter_files import all_parameters
 from rosrm_launch.beside import completed
 from rosrm_launch.model import Component, LaunchModel, Load, Parameters, Process, Transition, Wait
 from rosrm_launch.translate import translated
@@ -26,6 +34,12 @@ def specs_of(name):
     path = Path("/robot", name)
     work = completed(translation_of(name), path, None)
     return {spec.name: spec for spec in checked_work(work, path, None).specs}
+
+
+def parameters_of(spec):
+    """Return the parameters that the node of a process gets on its host."""
+    sections = all_parameters(spec)
+    return sections.get(qualified_name(spec.namespace, spec.node), sections.get("/**", {}))
 
 
 def made(*processes: Process, **others):
@@ -60,7 +74,7 @@ def test_arguments_conditions_groups_and_includes():
     )  # fmt: skip
     there = "$(find-pkg-share demo_robot)/maps/hall.yaml"
     assert left.arguments == ("--config", there)
-    assert left.parameters == {
+    assert parameters_of(left) == {
         "use_sim_time": False, "rate": 2.5, "tolerance": 0.001, "words": ["a", "b"],
         "gains": [1.0, 2.0], "map": there,
     }  # fmt: skip
@@ -73,9 +87,26 @@ def test_arguments_conditions_groups_and_includes():
 def test_parameters_of_a_full_name_override_those_of_a_pattern():
     """As launch_ros does, also if the pattern is in a later file."""
     lidar = specs_of("sensors.launch.xml")["sensors.lidar"]
-    assert lidar.parameters["rate"] == 8.0
-    assert lidar.parameters["nested.flag"] is True
+    assert parameters_of(lidar)["rate"] == 8.0
+    assert parameters_of(lidar)["nested.flag"] is True
     assert (lidar.restart.when, lidar.restart.delay) == ("always", 1.5)
+
+
+def test_a_process_gets_the_sections_of_all_nodes():
+    """Its program may have further nodes, such as the costmap of a controller of Nav2."""
+    given = [
+        Parameters(nodes="/controller", values={"rate": 20}),
+        Parameters(nodes="/costmap/costmap", values={"width": 3}),
+        Parameters(values={"use_sim_time": True}),
+    ]
+    (entry,) = made(node(0, "controller", parameters=given)).work["processes"]
+    sections = {
+        nodes: it["ros__parameters"] for one in entry["parameters"] for nodes, it in one.items()
+    }
+    assert list(sections.items()) == [
+        ("/**", {"use_sim_time": True}), ("/controller", {"rate": 20}),
+        ("/costmap/costmap", {"width": 3}),
+    ]  # fmt: skip
 
 
 def test_events_become_a_start_order_and_a_group():
@@ -106,9 +137,9 @@ def test_groups_have_an_environment_and_parameters_of_their_own():
         "DEMO_MODE": "plain", "DEMO_PATH": "/opt:/usr/share", "ROS_LOG_DIR": "/tmp",
     }  # fmt: skip
     assert grouped.prefix == ("env", "-u", "DEMO_GONE", "nice", "-n", "3")
-    assert grouped.parameters == {"speed": 3, "rate": 1.0, "tolerance": 0.001}
+    assert parameters_of(grouped) == {"speed": 3, "rate": 1.0, "tolerance": 0.001}
     assert grouped.remappings == {"chatter": "/chatter"}
-    assert (bare.environment, bare.prefix, bare.parameters) == ({}, (), {})
+    assert (bare.environment, bare.prefix, parameters_of(bare)) == ({}, (), {})
 
 
 def test_options_of_processes():
@@ -210,6 +241,18 @@ def test_components_of_a_container_that_the_file_does_not_start_are_listed():
     assert [(one.action, one.reason) for one in omissions] == [
         ("component q of /other", "the file starts no node of this name")
     ]
+
+
+def test_sections_that_no_node_gets_are_noted():
+    """The nodes that a component makes get the parameters of the container alone, as in launch."""
+    sections = ["/controller", "/planner", "/costmap/costmap"]
+    part = Component(package="p", plugin="q", name="controller", sections=sections)
+    other = Component(package="p", plugin="q", name="planner")
+    (note,) = made(node(0, "box", kind="container", components=[part, other])).notes
+    assert "component controller have sections for /costmap/costmap." in note
+    whole = [Parameters(nodes="/costmap/costmap", values={"width": 3})]
+    box = node(0, "box", kind="container", components=[part, other], parameters=whole)
+    assert made(box).notes == []
 
 
 def test_a_path_outside_of_packages_is_noted():
