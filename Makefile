@@ -25,7 +25,7 @@ export ROS_AUTOMATIC_DISCOVERY_RANGE := LOCALHOST
 export ROSRM_CRIU_PREFIX ?= $(CURDIR)/.venv/criu
 
 .DEFAULT_GOAL := help
-.PHONY: help setup environment check test lint format docs docs-links screenshots demo demo-migration demo-rollout bench evaluation fuzz clean
+.PHONY: help setup environment check test lint format pins docs docs-links screenshots demo demo-migration demo-rollout bench evaluation fuzz clean
 
 help: ## this list
 	@echo "make TARGET, each sets up what it needs:"
@@ -58,6 +58,9 @@ lint: setup ## ruff, the architecture's contracts, mypy
 format: setup ## correct what ruff can correct
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
+
+pins: setup ## resolve all requirements on each supported Python, after a change of constraints.txt
+	@$(BIN)/python -m scripts.pins
 
 # Without -W on the links: an answer that is slow or moved is reported, and does not end the check.
 SPHINX := $(BIN)/python -m sphinx -c docs/site -d build/doctrees -j auto

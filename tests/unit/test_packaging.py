@@ -6,40 +6,16 @@ import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
 
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from scripts.pins import OWN, PROJECTS, ROOT, digest, pin_lines, read, recorded, requirements
 
-ROOT = Path(__file__).resolve().parents[2]
-PROJECTS = [
-    path.relative_to(ROOT)
-    for folder in (".", "rosrm_msgs", "examples", "plugins/*", "tools/*")
-    for path in sorted(ROOT.glob(f"{folder}/pyproject.toml"))
-]
 PYTHONS = ("3.10", "3.11", "3.12", "3.13")
-
-
-def read(project: Path) -> dict[str, Any]:
-    return tomllib.loads((ROOT / project).read_text())
-
-
-def requirements(project: Path) -> Iterator[Requirement]:
-    settings = read(project)
-    lines = list(settings["build-system"]["requires"])
-    lines += settings["project"].get("dependencies", ())
-    for extra in settings["project"].get("optional-dependencies", {}).values():
-        lines += extra
-    yield from map(Requirement, lines)
 
 
 def applies(requirement: Requirement, python: str) -> bool:
@@ -50,11 +26,8 @@ def applies(requirement: Requirement, python: str) -> bool:
 def pins(python: str) -> dict[str, Version]:
     """Return the exact version of each constrained package on one Python."""
     found: dict[str, Version] = {}
-    for line in (ROOT / "constraints.txt").read_text().splitlines():
-        text = line.partition("#")[0].strip()
-        if not text:
-            continue
-        requirement = Requirement(text)
+    for line in pin_lines():
+        requirement = Requirement(line)
         if not applies(requirement, python):
             continue
         (specifier,) = requirement.specifier
@@ -63,7 +36,9 @@ def pins(python: str) -> dict[str, Version]:
     return found
 
 
-OWN = {canonicalize_name(read(project)["project"]["name"]) for project in PROJECTS}
+def test_the_pins_were_resolved_on_every_python() -> None:
+    """`make pins` has resolved exactly these pins and requirements, and recorded that."""
+    assert recorded() == digest(), "constraints.txt or a requirement has changed: run `make pins`"
 
 
 def test_every_distribution_is_looked_at() -> None:
@@ -97,11 +72,11 @@ def test_every_distribution_runs_on_the_same_pythons_under_the_same_licence(proj
 def test_the_readme_installs_all_that_runs() -> None:
     """Its one pip command names rosrm with ROS 2, the interfaces and each plugin, pinned.
 
-    The tools below `tools/` are optional.
+    The tools below `tools/` are optional, as are the services of containers, which come with them.
     """
     (line,) = re.findall(r"^\$ pip install (.*)$", (ROOT / "README.md").read_text(), re.MULTILINE)
     tools = [project.parent for project in PROJECTS if project.parent.parent.name == "tools"]
-    optional = (Path(), Path("examples"), *tools)
+    optional = (Path(), Path("examples"), Path("composition_interfaces"), *tools)
     needed = [f"./{p.parent}" for p in PROJECTS if p.parent not in optional]
     assert sorted(shlex.split(line)) == sorted(["-c", "constraints.txt", ".[ros]", *needed])
 
