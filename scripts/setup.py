@@ -53,6 +53,12 @@ PROGRESS = re.compile(
     r"Installing \S+ dependencies|Installing collected packages|\[\d+/\d+\] .*)"
 )
 
+#: Pip prints one of these when a pin does not fit. Before it gives up, it may try all versions of
+#: the packages around that pin for minutes, which cannot succeed with exact pins.
+REFUSED = re.compile(
+    r"pip is looking at multiple versions of |ResolutionImpossible|resolution-too-deep"
+)
+
 
 class SetupError(Exception):
     """An error for the user: what is wrong, where, and what to do about it."""
@@ -318,6 +324,34 @@ def editables(*, extras: str) -> list[object]:
     return arguments
 
 
+def pin_that_does_not_fit() -> str:
+    """Return which pin pip cannot install on this Python, for the user.
+
+    Without dependencies pip looks each pin up once, in some seconds, and names the one that fails.
+    """
+    words = ("install", "--dry-run", "--no-deps", "--ignore-installed", "--requirement")
+    command = [str(word) for word in (PYTHON, "-m", "pip", *words, CONSTRAINTS)]
+    try:
+        found = subprocess.run(
+            command, capture_output=True, text=True, check=False, timeout=45
+        ).stderr
+    except subprocess.TimeoutExpired:
+        return f"pip finds no versions that fit {CONSTRAINTS.name}; which pin fails: {LOG}"
+    failed = re.search(r"No matching distribution found for (?P<pin>\S+==(?P<version>\S+))", found)
+    if failed is None:
+        return (
+            f"pip finds no versions that fit {CONSTRAINTS.name}, although each pin alone can be "
+            "installed. Does another constraint apply (`pip config list`, PIP_CONSTRAINT)?"
+        )
+    needs = re.search(rf"\b{re.escape(failed['version'])} Requires-Python (?P<what>[^;\n]+)", found)
+    reason = f"needs Python {needs['what']}" if needs else "is not in the package index"
+    return (
+        f"{failed['pin']} of {CONSTRAINTS.name} {reason}, and this is Python "
+        f"{platform.python_version()} ({sys.executable}). Choose another one: "
+        "make setup PYTHON=/path/to/it. Please report this: every pin should fit this Python."
+    )
+
+
 class Steps:
     """A runner of commands, one after another, with their progress."""
 
@@ -352,6 +386,9 @@ class Steps:
                 log.write(line)
                 last_lines.append(line)
                 progress.show(line)
+                if REFUSED.search(line):
+                    progress.clear()
+                    raise SetupError(pin_that_does_not_fit())
             progress.clear()
         if process.returncode != 0:
             raise SetupError(
