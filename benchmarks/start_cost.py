@@ -60,11 +60,17 @@ def one_start(confinement: Confinement, number: int, limits: LimitRule) -> tuple
     null = os.open(os.devnull, os.O_RDWR | os.O_CLOEXEC)
     path = {"PATH": os.defpath}
 
-    def start(group: int, scheduler: spawn.Scheduler | None) -> int:
-        return spawn.spawn(("true",), path, "/", null, null, group=group, scheduler=scheduler)
+    def start(group: int, scheduler: spawn.Scheduler | None) -> spawn.Attempt:
+        program = spawn.Program(("true",), path, "/")
+        return spawn.begin(program, null, null, group=group, scheduler=scheduler)
 
     begun = time.perf_counter()
-    pid = confinement.start(("true", number), limits, start).pid
+    steps = confinement.start(("true", number), limits, start)
+    attempt = next(steps)
+    while not attempt.read():
+        pass
+    attempt.close()
+    pid = attempt.pid
     started = time.perf_counter()
     os.waitpid(pid, 0)
     os.close(null)

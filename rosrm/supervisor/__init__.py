@@ -5,8 +5,9 @@
     server.py             event loop, the imperative shell around `rosrm.core.supervisor`
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
-    spawn.py              spawning of one process
-    spawn_into.py         the same into a control group of version 2
+    spawn.py              start of one process: fork, and what its child does until the exec
+    spawn_into.py         the fork into a control group of version 2
+    exec_failures.py      reasons for programs that cannot be executed
     adoption.py           checks before a process that was started without rosrm is taken over
     secret_files.py       secrets, read just before a spawn
     confinement.py        start of an instance within its limits

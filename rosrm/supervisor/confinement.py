@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-from collections.abc import Callable, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Callable, Generator, Iterator
+from typing import Final, NamedTuple, TypeVar
 
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
-from rosrm.supervisor.spawn import Scheduler, ScheduleRefused, SpawnError
+from rosrm.supervisor.spawn import Attempt, Scheduler, ScheduleRefused, SpawnError
 from rosrm.wording import by_reason, listed
 
 #: In place of the descriptor of a control group.
@@ -20,8 +20,8 @@ NO_GROUP: Final = -1
 _ATTEMPTS: Final = 3
 _POLICIES: Final = {"fifo": os.SCHED_FIFO, "rr": os.SCHED_RR}
 
-#: Starts the process of an instance, given its group and its scheduling as in `spawn.spawn`.
-Spawn = Callable[[int, Scheduler | None], int]
+#: Forks the process of an instance, given its group and its scheduling as in `spawn.begin`.
+Spawn = Callable[[int, Scheduler | None], Attempt]
 
 
 class Confined(NamedTuple):
@@ -35,6 +35,12 @@ class Confined(NamedTuple):
     pid: int
     enforced: tuple[str, ...]
     note: str
+
+
+T = TypeVar("T")
+#: A start: yields each attempt, and is sent its pid once the process executes its program. What the
+#: attempt raises is thrown into it.
+Steps = Generator[Attempt, int, T]
 
 
 class Confinement:
@@ -53,7 +59,7 @@ class Confinement:
         self.groups = InstanceGroups(trees)
         self._cpus = os.sched_getaffinity(0)
 
-    def start(self, key: Key, limits: LimitRule, spawn: Spawn) -> Confined:
+    def start(self, key: Key, limits: LimitRule, spawn: Spawn) -> Steps[Confined]:
         """Start an instance within its limits.
 
         Raises:
@@ -67,8 +73,7 @@ class Confinement:
         _check_required(limits, faults)
         own = self._make_group(key, limits)
         realtime = bool(limits.policy) and "realtime" not in faults
-        with _on_cpus(limits.cpus, self._cpus):
-            pid, late = self._spawn(key, limits, spawn, realtime)
+        pid, late = yield from self._spawn(key, limits, spawn, realtime)
         own.update(late)
         if limits.nice and "nice" not in faults:
             own.update(_nice_fault(pid, limits))
@@ -110,28 +115,29 @@ class Confinement:
 
     def _spawn(
         self, key: Key, limits: LimitRule, spawn: Spawn, realtime: bool
-    ) -> tuple[int, dict[str, str]]:
+    ) -> Steps[tuple[int, dict[str, str]]]:
         """Spawn the process; return its pid, and what the kernel has refused."""
         if not realtime:
-            return self._spawn_inside(key, limits, spawn, None)
+            return (yield from self._spawn_inside(key, limits, spawn, None))
         try:
             scheduler = (_POLICIES[limits.policy], os.sched_param(limits.priority))
-            return self._spawn_inside(key, limits, spawn, scheduler)
+            return (yield from self._spawn_inside(key, limits, spawn, scheduler))
         except ScheduleRefused as error:
             fault = {"realtime": str(error)}
             _check_required(limits, fault)
-            pid, others = self._spawn_inside(key, limits, spawn, None)
+            pid, others = yield from self._spawn_inside(key, limits, spawn, None)
             return pid, {**fault, **others}
 
     def _spawn_inside(
         self, key: Key, limits: LimitRule, spawn: Spawn, scheduler: Scheduler | None
-    ) -> tuple[int, dict[str, str]]:
+    ) -> Steps[tuple[int, dict[str, str]]]:
         """Spawn the process in its group, or without one if no process can enter it."""
         fault, faults = "", dict[str, str]()
         for _ in range(_ATTEMPTS):
             try:
-                with self.groups.inside(key) as group:
-                    return spawn(group, scheduler), faults
+                with self.groups.inside(key) as group, _on_cpus(limits.cpus, self._cpus):
+                    attempt = spawn(group, scheduler)
+                return (yield attempt), faults
             except OSError as error:
                 fault = f"its control group cannot be entered: {error.strerror}"
                 # A supervisor beside this one may have removed the group, because it was empty.
@@ -139,7 +145,9 @@ class Confinement:
         faults = {name: fault for name in limits.wanted if name.startswith("limits.")}
         _check_required(limits, faults)
         self.groups.remove(key, 0.0)
-        return spawn(NO_GROUP, scheduler), faults
+        with _on_cpus(limits.cpus, self._cpus):
+            attempt = spawn(NO_GROUP, scheduler)
+        return (yield attempt), faults
 
 
 def cpus_in_words(numbers: list[int]) -> str:

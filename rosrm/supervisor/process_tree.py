@@ -35,13 +35,15 @@ class ProcessTrees:
         selector: watches the pidfds; the data of each is a function to call.
         happened: receives an event for each change of an instance.
         groups: control groups of the instances, which have all their processes.
+        reaped: called with the pid of an ended child that is not known as a leader; it may add it.
     """
 
     def __init__(
         self, state: str, selector: selectors.BaseSelector, happened: Callable[[Event], None],
-        groups: InstanceGroups,
+        groups: InstanceGroups, reaped: Callable[[int], None],
     ) -> None:  # fmt: skip
         self._groups = groups
+        self._reaped = reaped
         self._state = state
         self._selector = selector
         self._happened = happened
@@ -149,6 +151,8 @@ class ProcessTrees:
             if pid == 0:
                 break
             self._adopted.pop(pid, None)
+            if pid not in self._children:
+                self._reaped(pid)
             key = self._children.pop(pid, None)
             if key is not None:
                 code = os.waitstatus_to_exitcode(status)

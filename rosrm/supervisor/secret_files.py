@@ -8,22 +8,12 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Mapping
 from typing import Final
 
 from rosrm.supervisor.spawn import SpawnError
 
 #: Most bytes of a secret; the kernel refuses a variable of 128 KiB or more.
 MOST_BYTES: Final = 1 << 16
-
-
-def read_all(secrets: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables with the values of secrets. Raises SpawnError.
-
-    Args:
-        secrets: variable to the path of its file.
-    """
-    return {name: _read(name, path) for name, path in secrets.items()}
 
 
 def is_exposed(path: str) -> bool:
@@ -34,7 +24,8 @@ def is_exposed(path: str) -> bool:
         return False
 
 
-def _read(name: str, path: str) -> str:
+def read(name: str, path: str) -> str:
+    """Return the value of a secret from its file. Raises SpawnError."""
     try:
         content = _content(path)
     except (OSError, ValueError) as error:  # ValueError: a path that cannot be encoded

@@ -33,11 +33,10 @@ from rosrm.supervisor import (
     own_log,
     paths,
     procfs,
-    secret_files,
     spawn,
     takeover,
 )
-from rosrm.supervisor.confinement import Confined, Confinement
+from rosrm.supervisor.confinement import Confined, Confinement, Steps
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.instance_groups import LimitRefused
 from rosrm.supervisor.instance_record import InstanceRecord
@@ -47,14 +46,34 @@ from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm.wording import listed
 
-#: Most spawns before the loop looks at other events.
+#: Most starts before their exec at a time.
 SPAWNS_A_ROUND: Final = 8
+#: Seconds after which a start that waits for a path no longer counts among these.
+LATE_START: Final = 0.5
 #: Seconds between attempts to write the record while the disk is full.
 RECORD_AGAIN: Final = 1.0
 #: Most seconds of one wait: `epoll` takes 24.8 days at most, and raises an error for more.
 LONGEST_WAIT: Final = 3600.0
 #: Seconds that the client has to read the last messages.
 END_PATIENCE: Final = 1.0
+
+
+class _Start:
+    """A start whose process has not executed its program yet.
+
+    Attributes:
+        attempt: the process.
+        birth: of the process, in clock ticks.
+        late: monotonic time from which the start counts as one that waits for a path.
+        due: monotonic time at which the start fails.
+    """
+
+    def __init__(self, key: Key, program: spawn.Program, log: int, steps: Steps[Confined]) -> None:
+        self.key, self.program, self.log, self.steps = key, program, log, steps
+        self.late = time.monotonic() + LATE_START
+        self.due = self.late - LATE_START + spawn.PATIENCE
+        self.birth = 0
+        self.attempt: spawn.Attempt
 
 
 class Server:
@@ -77,7 +96,9 @@ class Server:
         self._core = SupervisorState()
         self._confinement = Confinement(state)
         self._groups = self._confinement.groups
-        self._trees = ProcessTrees(state, self._selector, self._happened, self._groups)
+        self._trees = ProcessTrees(
+            state, self._selector, self._happened, self._groups, self._reaped
+        )
         self._record = InstanceRecord(state)
         self._last_contact = lease_file.LastContact(state)
         self._logs = LogKeeper(state, limits)
@@ -86,6 +107,8 @@ class Server:
         self._environments: dict[str, dict[str, str]] = {}
         self._notes: list[str] = []
         self._spawns: deque[Key] = deque()
+        self._starts: dict[int, _Start] = {}  # by pid, before the exec
+        self._stuck: dict[int, tuple[str, str]] = {}  # killed before the exec: process, its step
         self._prepared: Key | None = None
         self._ended: list[Key] = []  # with control groups that are still to be removed
         self._unsent: list[bytes] = []
@@ -126,6 +149,7 @@ class Server:
         self._logs.look(now)
         self._trees.look(now)
         self._groups.look(now)
+        self._abandon_late(now)
         self._spawn_some()
         self._remove_groups()
         if self._record.is_large():
@@ -141,12 +165,14 @@ class Server:
         return deadline is not None and deadline <= time.monotonic()
 
     def _timeout(self) -> float | None:
-        if self._spawns:
+        if self._spawns and self._room_for_starts():
             return 0.0
         parts = (self._core, self._logs, self._trees, self._groups)
         deadlines = [part.deadline() for part in parts]
         if self._record.trouble:
             deadlines.append(time.monotonic() + RECORD_AGAIN)
+        starts = self._starts.values()
+        deadlines += [start.due if self._is_late(start) else start.late for start in starts]
         due = [deadline for deadline in deadlines if deadline is not None]
         return min(max(0.0, min(due) - time.monotonic()), LONGEST_WAIT) if due else None
 
@@ -190,8 +216,8 @@ class Server:
                 self._groups.remove(key, time.monotonic())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
         status = messages.Status.of(instance)
-        # The slave has ordered the start, and most spawns are in the same round. So `starting` is
-        # sent only if the round ends without the outcome of the spawn.
+        # The slave has ordered the start, and most spawns take a moment. So `starting` is sent only
+        # if the spawn cannot begin in this round, or is late.
         self._first_starts.pop(key, None)
         if instance.phase == STARTING and not instance.started:
             self._first_starts[key] = status
@@ -199,15 +225,20 @@ class Server:
             self._unsent.append(messages.encode_status(status))
 
     def _unspawn(self, key: Key) -> None:
+        begun = [start for start in self._starts.values() if start.key == key]
+        for start in begun:
+            self._abandon(start)
         if key in self._spawns:
             self._spawns.remove(key)
-            self._happened(SpawnFailed(key, ""))
+        elif not begun:
+            return
+        self._happened(SpawnFailed(key, ""))
 
     def _report(self) -> None:
-        starts = map(messages.encode_status, self._first_starts.values())
-        unsent = b"".join([*self._unsent, *starts])
+        prompt = {start.key for start in self._starts.values() if not self._is_late(start)}
+        due = [self._first_starts.pop(key) for key in self._first_starts.keys() - prompt]
+        unsent = b"".join([*self._unsent, *map(messages.encode_status, due)])
         self._unsent.clear()
-        self._first_starts.clear()
         if self._client is not None and unsent:
             self._send(self._client, unsent)
 
@@ -236,9 +267,10 @@ class Server:
         self._ended.clear()
 
     def _spawn_some(self) -> None:
-        if not self._spawns:
+        count = min(len(self._spawns), self._room_for_starts())
+        if not count:
             return
-        keys = [self._spawns.popleft() for _ in range(min(len(self._spawns), SPAWNS_A_ROUND))]
+        keys = [self._spawns.popleft() for _ in range(count)]
         self._record.spawning(keys)
         durable = self._record.flush()
         for key in keys:
@@ -253,13 +285,103 @@ class Server:
         if launch is not None and launch.adoption and not self._core.instances[key].started:
             self._adopt(key, launch, launch.adoption)
             return
-        birth = procfs.ticks_now()
         try:
-            pid, enforced, note = self._spawn_process(key)
+            self._check_former_start(key)
+            program = self._program(launch)
+            log = self._open_log(key)
         except spawn.SpawnError as error:
             self._spawn_failed(key, str(error), error.transient)
             return
-        self._trees.add_child(key, pid, birth)
+
+        def begin(group: int, scheduler: spawn.Scheduler | None) -> spawn.Attempt:
+            return spawn.begin(program, self._null, log, group=group, scheduler=scheduler)
+
+        assert launch is not None
+        steps = self._confinement.start(key, launch.limits, begin)
+        self._advance(_Start(key, program, log, steps), lambda: next(steps))
+
+    def _room_for_starts(self) -> int:
+        """Return how many starts may begin, as each has a copy of this process before its exec.
+
+        A late one waits for a path, and makes room for others.
+        """
+        young = sum(not self._is_late(start) for start in self._starts.values())
+        return max(0, SPAWNS_A_ROUND - young)
+
+    @staticmethod
+    def _is_late(start: _Start) -> bool:
+        return time.monotonic() >= start.late
+
+    def _check_former_start(self, key: Key) -> None:
+        for process, step in self._stuck.values():
+            if process == key[0]:
+                message = f"a former start of it still waits for {step}, which does not answer"
+                raise spawn.SpawnError(message, transient=True)
+
+    def _advance(self, start: _Start, step: Callable[[], spawn.Attempt]) -> None:
+        """Continue a start, to its next attempt or to its end."""
+        birth = procfs.ticks_now()
+        try:
+            with score_of_children(), descriptors.limited(self._files):
+                start.attempt = step()
+        except StopIteration as done:
+            self._started(start, done.value)
+        except spawn.SpawnError as error:
+            self._spawn_failed(start.key, str(error), error.transient)
+        else:
+            start.birth = birth
+            self._starts[start.attempt.pid] = start
+            report = start.attempt.report
+            self._selector.register(report, selectors.EVENT_READ, lambda: self._read_report(start))
+            return
+        os.close(start.log)
+
+    def _read_report(self, start: _Start) -> None:
+        """Read a part of the report of a start, and continue the start at the end of the report."""
+        if not start.attempt.read():
+            return
+        self._stop_watching(start)
+        try:
+            start.attempt.check()
+        except (spawn.SpawnError, OSError) as error:
+            fault = error
+            self._advance(start, lambda: start.steps.throw(fault))
+        else:
+            self._advance(start, lambda: start.steps.send(start.attempt.pid))
+
+    def _stop_watching(self, start: _Start) -> None:
+        del self._starts[start.attempt.pid]
+        self._selector.unregister(start.attempt.report)
+        start.attempt.close()
+
+    def _abandon(self, start: _Start) -> None:
+        """Kill a process before its exec. It may end much later, so nothing waits for that."""
+        self._stop_watching(start)
+        os.close(start.log)
+        os.kill(start.attempt.pid, signal.SIGKILL)
+        self._stuck[start.attempt.pid] = (start.key[0], start.attempt.step)
+
+    def _abandon_late(self, now: float) -> None:
+        """Report the starts that a path holds up."""
+        for start in [one for one in self._starts.values() if one.due <= now]:
+            self._abandon(start)
+            failed = f"{start.attempt.step} does not answer ({spawn.PATIENCE:g} s)"
+            self._spawn_failed(start.key, failed, transient=True)
+
+    def _reaped(self, pid: int) -> None:
+        """Note the end of a child that is no leader yet, and may have executed its program."""
+        self._stuck.pop(pid, None)
+        while pid in self._starts:
+            self._read_report(self._starts[pid])
+
+    def _started(self, start: _Start, confined: Confined) -> None:
+        """Report a start whose process executes its program."""
+        key, (pid, enforced, note) = start.key, confined
+        environment = start.program.environment
+        if start_trace.VARIABLE in environment and not self._core.instances[key].started:
+            traced = start_trace.stamped_in(environment, spawned=time.time_ns())
+            logs.note_trace(start.log, traced[start_trace.VARIABLE])
+        self._trees.add_child(key, pid, start.birth)
         self._logs.watch(key, time.monotonic(), pid)
         self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
 
@@ -283,33 +405,21 @@ class Server:
         """Report a failure. All clients may read the reason, so STATE stands for the directory."""
         self._happened(SpawnFailed(key, reason.replace(self._state, "STATE"), transient))
 
-    def _spawn_process(self, key: Key) -> Confined:
-        launch = self._launches.get(key)
-        if launch is None:
-            raise spawn.SpawnError("its order was lost with a part of the record")
+    def _open_log(self, key: Key) -> int:
         try:
-            log = self._logs.open(key, self._core.instances)
+            return self._logs.open(key, self._core.instances)
         except OSError as error:
             message = f"its log cannot be opened: {error.strerror}"
             raise spawn.SpawnError(message, transient=True) from None
-        try:
-            directory = launch.directory or paths.work_directory(self._state)
-            environment = start_trace.stamped_in(self._environment(launch), recorded=time.time_ns())
 
-            def start(group: int, scheduler: spawn.Scheduler | None) -> int:
-                return spawn.spawn(
-                    launch.argv, environment, directory, self._null, log, group=group,
-                    scheduler=scheduler, nice=launch.limits.nice,
-                )  # fmt: skip
-
-            with score_of_children(), descriptors.limited(self._files):
-                confined = self._confinement.start(key, launch.limits, start)
-            if start_trace.VARIABLE in environment and not self._core.instances[key].started:
-                traced = start_trace.stamped_in(environment, spawned=time.time_ns())
-                logs.note_trace(log, traced[start_trace.VARIABLE])
-            return confined
-        finally:
-            os.close(log)
+    def _program(self, launch: messages.Launch | None) -> spawn.Program:
+        if launch is None:
+            raise spawn.SpawnError("its order was lost with a part of the record")
+        environment = start_trace.stamped_in(self._environment(launch), recorded=time.time_ns())
+        directory = launch.directory or paths.work_directory(self._state)
+        return spawn.Program(
+            launch.argv, environment, directory, launch.secrets, launch.limits.nice
+        )
 
     def _environment(self, launch: messages.Launch) -> dict[str, str]:
         base = self._environments.get(launch.environment)
@@ -324,7 +434,6 @@ class Server:
                 environment.pop(name, None)
             else:
                 environment[name] = value
-        environment.update(secret_files.read_all(launch.secrets))
         environment[INSTANCE_MARK] = mark(launch.instance)
         environment[SUPERVISOR_MARK] = self._state
         return environment

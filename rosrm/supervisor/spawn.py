@@ -1,26 +1,33 @@
 """Start of one process: a session leader with its output in a file, inheriting nothing else.
 
-`os.posix_spawn` shares the parent's memory until the exec (vfork), so a spawn costs half a
-millisecond. It cannot change the directory, so the supervisor (one thread) changes its own.
+The forked child does all that touches a path of the user: it reads the files of secrets, enters the
+working directory, searches the PATH, and executes the program. On a file system that does not
+answer, each of these stops the caller, even against SIGKILL. The parent only reads the report of
+the child, which names the step that the child is at. A successful exec closes the report.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
+import resource
 import signal
-import time
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Final, NamedTuple, NoReturn
 
+#: Seconds for the steps of one start; after them, the path of the current step has no answer.
+PATIENCE: Final = 10.0
 #: Errors that may pass: the same spawn is tried again where the restart policy allows.
 _TRANSIENT: Final = frozenset(
-    {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY}
+    {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.EIO}
 )
-#: Python ignores some signals, so each is reset: a process starts with all at their default.
-_EVERY_SIGNAL: Final = [
-    number for number in signal.valid_signals() if number not in (signal.SIGKILL, signal.SIGSTOP)
-]
+#: Bytes of one read of a report.
+_PART: Final = 1 << 16
+#: First letters of the messages in a report; a NUL byte ends each.
+_STEP, _FAULT, _TRANSIENT_FAULT, _NO_SCHEDULE, _NO_GROUP = "@!~sg"
+#: Descriptor of the report in the child, the first one behind the standard ones.
+_REPORT: Final = 3
 
 
 class SpawnError(Exception):
@@ -45,52 +52,199 @@ class ScheduleRefused(SpawnError):
 Scheduler = tuple[int, os.sched_param]
 
 
-def spawn(
-    argv: tuple[str, ...], environment: Mapping[str, str], directory: str, null: int, log: int, *,
-    group: int = -1, scheduler: Scheduler | None = None, nice: int = 0,
-) -> int:  # fmt: skip
-    """Start a process and return its pid. Raises SpawnError.
+class Program(NamedTuple):
+    """A program to start.
+
+    Attributes:
+        argv: command line; the first word is looked up in the PATH of `environment`.
+        environment: the whole environment, without the secrets.
+        directory: working directory.
+        secrets: variable to the path of the file with its value.
+        nice: niceness; 0: that of this process. Without the right to it, that of this process.
+    """
+
+    argv: tuple[str, ...]
+    environment: Mapping[str, str]
+    directory: str
+    secrets: Mapping[str, str] = {}
+    nice: int = 0
+
+
+class Attempt:
+    """A forked process, until it has become its program or has failed to.
+
+    Attributes:
+        pid: of the process.
+        report: descriptor that is readable when `read` has something to do.
+    """
+
+    def __init__(self, pid: int, report: int) -> None:
+        self.pid = pid
+        self.report = report
+        self._told = b""
+
+    def read(self) -> bool:
+        """Read a part of the report, which must be readable; return True at its end."""
+        part = os.read(self.report, _PART)
+        self._told += part
+        return not part
+
+    def close(self) -> None:
+        """Read no more of the report."""
+        os.close(self.report)
+
+    @property
+    def step(self) -> str:
+        """Return the subject of a sentence about the path that the process waits for."""
+        return next((text for kind, text in reversed(self._messages()) if kind == _STEP), "it")
+
+    def check(self) -> None:
+        """Raise the failure that the report has, if any.
+
+        Raises:
+            SpawnError: the process cannot be started.
+            OSError: it cannot enter its control group.
+        """
+        for kind, text in self._messages():
+            if kind == _NO_SCHEDULE:
+                raise ScheduleRefused(text)
+            if kind == _NO_GROUP:
+                raise OSError(int(text), os.strerror(int(text)))
+            if kind != _STEP:
+                raise SpawnError(text, transient=kind == _TRANSIENT_FAULT)
+
+    def _messages(self) -> list[tuple[str, str]]:
+        texts = [os.fsdecode(one) for one in self._told.split(b"\0")[:-1]]
+        return [(text[0], text[1:]) for text in texts]
+
+
+def begin(
+    program: Program, null: int, log: int, *, group: int = -1, scheduler: Scheduler | None = None
+) -> Attempt:
+    """Fork a process that becomes a program.
 
     Args:
-        argv: command line; the first word is looked up in the PATH of `environment`.
-        environment: the whole environment.
         null: descriptor that becomes its standard input.
         log: descriptor that becomes its standard output and error.
         group: descriptor of its control group of version 2; -1: that of this process.
         scheduler: None: that of this process.
-        nice: niceness; 0: that of this process. Without the right to it, that of this process.
-    """
-    _enter(directory)
-    path = find_executable(argv[0], environment)
-    try:
-        if group >= 0 or nice:  # `posix_spawn` can set neither
-            from rosrm.supervisor.spawn_into import spawn_into  # noqa: PLC0415 - loads 400 KiB
 
-            program = (path, argv, environment)
-            return spawn_into(group, program, null=null, log=log, scheduler=scheduler, nice=nice)
-        return os.posix_spawn(
-            path,
-            argv,
-            environment,
-            file_actions=[
-                (os.POSIX_SPAWN_DUP2, null, 0),
-                (os.POSIX_SPAWN_DUP2, log, 1),
-                (os.POSIX_SPAWN_DUP2, log, 2),
-            ],
-            setsid=True,
-            setsigmask=(),
-            setsigdef=_EVERY_SIGNAL,
-            **({} if scheduler is None else {"scheduler": scheduler}),  # type: ignore[arg-type]
-        )
-    except OSError as error:
-        if scheduler is not None and error.errno == errno.EPERM:
-            raise ScheduleRefused(f"{path} may not have real-time scheduling here") from None
-        transient = error.errno in _TRANSIENT
-        raise SpawnError(_why(path, directory, error), transient=transient) from None
-    except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
-        raise SpawnError(f"{argv[0]!r} cannot be started: {error}") from None
+    Raises:
+        SpawnError: no process can be forked.
+        OSError: the control group is gone.
+    """
+    report, told = os.pipe2(os.O_CLOEXEC)
+    try:
+        pid, inside = _fork(group)
+        if not pid:
+            _become(program, (null, log, told), -1 if inside else group, scheduler)
+    except BaseException:
+        os.close(report)
+        raise
     finally:
-        os.chdir("/")  # otherwise the supervisor would keep a user's mount busy
+        os.close(told)
+    return Attempt(pid, report)
+
+
+def _fork(group: int) -> tuple[int, bool]:
+    """Return the pid, 0 in the child, and True if the child is in its group already."""
+    if group >= 0:
+        from rosrm.supervisor.spawn_into import fork_into  # noqa: PLC0415 - loads 400 KiB
+
+        pid = fork_into(group)
+        if pid is not None:
+            return pid, True
+    try:
+        return os.fork(), group < 0
+    except OSError as error:
+        message = f"no process can be forked: {error.strerror}"
+        raise SpawnError(message, transient=True) from None
+
+
+# --- in the child -----------------------------------------------------------------------------
+
+
+def _become(
+    program: Program, files: tuple[int, int, int], group: int, scheduler: Scheduler | None
+) -> NoReturn:
+    """Turn the child into the program, or report why that is impossible."""
+    null, log, told = files
+
+    def tell(kind: str, text: str) -> None:
+        os.write(told, os.fsencode(f"{kind}{text}".replace("\0", "\\0")) + b"\0")
+
+    try:
+        os.setsid()
+        _reset_signals()
+        if group >= 0 and not _enter_group(group, tell):
+            os._exit(127)
+        if program.nice:
+            with contextlib.suppress(OSError):  # the caller compares the result
+                os.setpriority(os.PRIO_PROCESS, 0, program.nice)
+        for descriptor, its in ((null, 0), (log, 1), (log, 2), (told, _REPORT)):
+            os.dup2(descriptor, its, inheritable=its != _REPORT)
+        told = _REPORT
+        # A child that waits for a path must not hold the lock and the socket of its supervisor.
+        os.closerange(_REPORT + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+        _execute(program, tell, scheduler)
+    except SpawnError as error:
+        kind = _NO_SCHEDULE if isinstance(error, ScheduleRefused) else _FAULT
+        tell(_TRANSIENT_FAULT if error.transient else kind, str(error))
+    except BaseException as fault:  # noqa: BLE001 - the child must not return into the caller
+        tell(_FAULT, f"{program.argv[0]!r} cannot be started: {fault}")
+    finally:
+        os._exit(127)
+
+
+def _reset_signals() -> None:
+    """Give all signals their default; the caller's Python, or who started it, ignores some."""
+    signal.set_wakeup_fd(-1)  # a pipe of the parent
+    for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
+        if signal.getsignal(number) != signal.SIG_DFL:
+            signal.signal(number, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_SETMASK, ())
+
+
+def _enter_group(group: int, tell: Callable[[str, str], None]) -> bool:
+    try:
+        os.write(os.open("cgroup.procs", os.O_WRONLY, dir_fd=group), b"0")
+    except OSError as error:
+        tell(_NO_GROUP, str(error.errno))
+        return False
+    return True
+
+
+def _execute(
+    program: Program, tell: Callable[[str, str], None], scheduler: Scheduler | None
+) -> NoReturn:
+    environment, directory = dict(program.environment), program.directory
+    tell(_STEP, f"the working directory {directory!r}")
+    _enter(directory)
+    if program.secrets:
+        from rosrm.supervisor import secret_files  # noqa: PLC0415 - it imports this module
+
+        for name, path in program.secrets.items():
+            tell(_STEP, f"the file {path!r} of the secret {name}")
+            environment[name] = secret_files.read(name, path)
+    word = program.argv[0]
+    if "/" not in word:
+        tell(_STEP, f"a directory of the PATH, {environment.get('PATH', os.defpath)!r},")
+    path = find_executable(word, environment)
+    tell(_STEP, f"the program {path!r}")
+    if scheduler is not None:
+        try:
+            os.sched_setscheduler(0, *scheduler)
+        except PermissionError:
+            raise ScheduleRefused(f"{path} may not have real-time scheduling here") from None
+    try:
+        os.execve(path, program.argv, environment)  # noqa: S606 - no shell is wanted
+    except OSError as error:
+        from rosrm.supervisor import exec_failures  # noqa: PLC0415 - only a failure needs it
+
+        reason = exec_failures.reason(os.path.join(directory, path), error)
+        raise SpawnError(reason, transient=error.errno in _TRANSIENT) from None
+    except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
+        raise SpawnError(f"{word!r} cannot be started: {error}") from None
 
 
 def _enter(directory: str) -> None:
@@ -102,32 +256,11 @@ def _enter(directory: str) -> None:
         raise SpawnError(message) from None
 
 
-#: Cache of program paths, with the times at which they expire, because a search makes a system call
-#: for each directory of the PATH, and jobs often run the same program.
-_found: Final[dict[tuple[str, str], tuple[str, float]]] = {}
-#: Seconds for which a path is cached; most cached paths.
-_KEPT_FOR: Final = 1.0
-_MOST_KEPT: Final = 100
-
-
 def find_executable(word: str, environment: Mapping[str, str]) -> str:
     """Return the path of the program that a command's first word names. Raises SpawnError."""
     if "/" in word:
         return word
     search = environment.get("PATH", os.defpath)
-    path, until = _found.get((word, search), ("", 0.0))
-    now = time.monotonic()
-    if now < until and os.access(path, os.X_OK):
-        return path
-    path = _search(word, search)
-    if os.path.isabs(path):  # a relative path depends on the working directory
-        if len(_found) >= _MOST_KEPT:
-            _found.clear()
-        _found[word, search] = path, now + _KEPT_FOR
-    return path
-
-
-def _search(word: str, search: str) -> str:
     reason = f"program {word!r} is not on the PATH"
     for directory in search.split(os.pathsep):
         path = os.path.join(directory or ".", word)
@@ -136,16 +269,3 @@ def _search(word: str, search: str) -> str:
                 return path
             reason = f"program {word!r} on the PATH, {path}, is not executable"
     raise SpawnError(f"{reason}\nthe PATH is {search}")
-
-
-def _why(path: str, directory: str, error: OSError) -> str:
-    path = os.path.join(directory, path)
-    if error.errno == errno.ENOENT and os.path.exists(path):
-        return f"{path} cannot be started: the interpreter in its first line does not exist"
-    if error.errno == errno.ENOENT:
-        return f"no executable {path!r} exists"
-    if error.errno == errno.EACCES:
-        return f"{path} cannot be started: it is not executable, or may not be reached"
-    if error.errno == errno.ENOEXEC:
-        return f"{path} cannot be started: it is neither a program nor a script with #!"
-    return f"{path} cannot be started: {error.strerror}"

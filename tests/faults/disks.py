@@ -47,14 +47,14 @@ class Disk:
 
 
 @contextlib.contextmanager
-def small_disk(place: Path) -> Iterator[Disk]:
-    """Mount a tmpfs of 1 MiB that only this test and its children see; unmount it at the end."""
+def small_disk(place: Path, *options: str, size: str = "1m") -> Iterator[Disk]:
+    """Mount a small tmpfs that only this test and its children see; unmount it at the end."""
     place.mkdir(parents=True)
     if os.geteuid() != 0 or ctypes.CDLL(None).unshare(_CLONE_NEWNS) != 0:
         pytest.skip("only root may mount a small file system")
     subprocess.run(["mount", "--make-rprivate", "/"], check=True)
-    options = ["-o", "size=1m,mode=700"]
-    subprocess.run(["mount", "-t", "tmpfs", *options, "tmpfs", place], check=True)
+    chosen = ",".join((f"size={size},mode=700", *options))
+    subprocess.run(["mount", "-t", "tmpfs", "-o", chosen, "tmpfs", place], check=True)
     try:
         yield Disk(place)
     finally:

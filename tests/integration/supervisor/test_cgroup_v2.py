@@ -20,6 +20,7 @@ from rosrm.runtime import cgroups
 from rosrm.supervisor import spawn, spawn_into
 from rosrm.supervisor.group_trees import Tree
 from rosrm.supervisor.instance_groups import InstanceGroups, limit_files
+from tests.starting import executed
 from tests.waiting import wait_until
 
 KEY = ("camera", 1)
@@ -78,13 +79,12 @@ def groups(group: str) -> InstanceGroups:
     return InstanceGroups([Tree(2, f"{group}/top", group, ())])
 
 
-def start(groups: InstanceGroups, *argv: str, **options) -> int:
+def start(groups: InstanceGroups, *argv: str, nice: int = 0, **options) -> int:
     """Start a program in the group of the instance; return its pid."""
+    program = spawn.Program(argv, {"PATH": os.environ["PATH"]}, "/", nice=nice)
     with Path(os.devnull).open("r+") as null, groups.inside(KEY) as inside:
-        return spawn.spawn(
-            argv, {"PATH": os.environ["PATH"]}, "/", null.fileno(), null.fileno(), group=inside,
-            **options,
-        )  # fmt: skip
+        attempt = spawn.begin(program, null.fileno(), null.fileno(), group=inside, **options)
+        return executed(attempt)
 
 
 @pytest.fixture(params=["clone3", "without clone3"])

@@ -217,8 +217,9 @@ def test_a_damaged_line_is_left_out_and_reported(host, client):
 
 def test_what_starts_after_the_record_was_compacted_is_taken_over(host, client):
     """Compaction with nothing running keeps the environment that the client sent once."""
-    large = "x" * (instance_record.COMPACT_BYTES + 1)
-    host.run(client, host.order("large", "/no/such/program", memo=large))
+    large = "x" * (instance_record.COMPACT_BYTES * 2 // 3)  # the second one exceeds the bound
+    for number in (1, 2):
+        host.run(client, host.order("large", "/no/such/program", memo=large, number=number))
     always = RestartPolicy(when="always", delay=0.01)
     code = "import os, time; print(os.environ.get('PATH'), flush=True); time.sleep(1000)"
     client.start([host.python("later", code, restart=always)])

@@ -21,6 +21,7 @@ from rosrm.supervisor.confinement import Confinement
 from rosrm.supervisor.group_trees import Tree
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused, limit_files
 from rosrm.supervisor.spawn import ScheduleRefused, SpawnError
+from tests.starting import finish
 from tests.waiting import PATIENCE
 
 KEY = ("camera", 1)
@@ -49,7 +50,7 @@ def test_what_the_host_cannot_enforce_is_left_out(confinement) -> None:
     confinement.missing = {"limits.memory": "nothing is delegated", "realtime": "no rights"}
     limits = LimitRule(memory=1e8, cpu=1.0, cpus=(min(os.sched_getaffinity(0)),), policy="fifo",
                        priority=1)  # fmt: skip
-    assert confinement.start(KEY, limits, started)[1:] == (("limits.cpu", "cpus"), "")
+    assert finish(confinement.start(KEY, limits, started))[1:] == (("limits.cpu", "cpus"), "")
 
 
 def test_required_limits_that_cannot_be_enforced_refuse_the_start(confinement) -> None:
@@ -59,7 +60,7 @@ def test_required_limits_that_cannot_be_enforced_refuse_the_start(confinement) -
     )
     limits = LimitRule(memory=1e8, cpu=1.0, nice=-5, required=True)
     with pytest.raises(SpawnError) as refused:
-        confinement.start(KEY, limits, not_started)
+        finish(confinement.start(KEY, limits, not_started))
     assert not refused.value.transient
     assert str(refused.value) == (
         "its limits are required, and this host cannot enforce limits.memory, limits.cpu and nice: "
@@ -70,8 +71,8 @@ def test_required_limits_that_cannot_be_enforced_refuse_the_start(confinement) -
 def test_a_higher_niceness_needs_no_rights(confinement) -> None:
     """A higher niceness is set even where a lower one cannot be."""
     confinement.missing = {"nice": "no rights"}
-    assert confinement.start(KEY, LimitRule(nice=5, required=True), started)[1] == ("nice",)
-    assert confinement.start(KEY, LimitRule(nice=-5), started)[1] == ()
+    assert finish(confinement.start(KEY, LimitRule(nice=5, required=True), started))[1] == ("nice",)
+    assert finish(confinement.start(KEY, LimitRule(nice=-5), started))[1] == ()
 
 
 @pytest.mark.parametrize("required", [True, False])
@@ -88,10 +89,10 @@ def test_a_niceness_that_the_kernel_refuses(confinement, required: bool) -> None
     try:
         if required:
             with pytest.raises(SpawnError, match=note):
-                confinement.start(KEY, limits, start)
+                finish(confinement.start(KEY, limits, start))
             assert processes[0].wait(PATIENCE) == -signal.SIGKILL
         else:
-            assert confinement.start(KEY, limits, start)[1:] == ((), note)
+            assert finish(confinement.start(KEY, limits, start))[1:] == ((), note)
     finally:
         processes[0].kill()
         processes[0].wait()
@@ -108,25 +109,25 @@ def full(tmp_path: Path) -> InstanceGroups:
 def test_a_group_that_cannot_be_made_is_noted(confinement, full: InstanceGroups) -> None:
     """The process runs without this limit; a process without limits has no note."""
     confinement.groups = full
-    pid, enforced, note = confinement.start(KEY, LimitRule(memory=1e8, nice=3), started)
+    pid, enforced, note = finish(confinement.start(KEY, LimitRule(memory=1e8, nice=3), started))
     assert (pid, enforced) == (2**22 + 1, ("nice",))
     assert note.startswith("limits.memory: no control group ")
     assert note.endswith("top/camera.1 can be made: Not a directory")
-    assert confinement.start(KEY, LimitRule(), started)[1:] == ((), "")
+    assert finish(confinement.start(KEY, LimitRule(), started))[1:] == ((), "")
 
 
 def test_a_group_that_cannot_be_made_refuses_a_start_that_requires_it(confinement, full) -> None:
     """The master tries another host."""
     confinement.groups = full
     with pytest.raises(SpawnError, match=r"cannot enforce limits\.memory: no control group "):
-        confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
+        finish(confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started))
 
 
 def test_limits_that_change_without_a_group_do_not_hold(confinement, full) -> None:
     """They are refused where they are required."""
     confinement.groups = full
     former, limits = LimitRule(memory=1e8), LimitRule(memory=2e8)
-    confinement.start(KEY, former, started)
+    finish(confinement.start(KEY, former, started))
     assert confinement.change(KEY, former, limits) == ()
     refusal = r"cannot enforce limits\.memory: the instance has no control group for it"
     with pytest.raises(LimitRefused, match=refusal):
@@ -224,7 +225,11 @@ def in_group(group: int, _scheduler: object) -> int:
 def test_a_group_that_was_removed_is_made_again(confinement) -> None:
     """Another supervisor may take it for a left-over."""
     confinement.groups = Closed(1)
-    assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (7, ("limits.memory",), "")
+    assert finish(confinement.start(KEY, LimitRule(memory=1e8), in_group)) == (
+        7,
+        ("limits.memory",),
+        "",
+    )
 
 
 @pytest.mark.parametrize("required", [True, False])
@@ -238,19 +243,19 @@ def test_a_group_that_is_made_again_without_its_limits_is_noted(
     limits = LimitRule(memory=1e8, cpu=1.0, required=required)
     if required:
         with pytest.raises(SpawnError, match=r"enforce limits\.memory: memory\.max cannot be"):
-            confinement.start(KEY, limits, not_started)
+            finish(confinement.start(KEY, limits, not_started))
     else:
         note = "limits.memory: memory.max cannot be written"
-        assert confinement.start(KEY, limits, in_group) == (7, ("limits.cpu",), note)
+        assert finish(confinement.start(KEY, limits, in_group)) == (7, ("limits.cpu",), note)
 
 
 def test_a_group_that_no_process_can_enter_is_left_out(confinement) -> None:
     """The process runs without, unless its limits are required."""
     confinement.groups = Closed(9)
     note = "limits.memory: its control group cannot be entered: Invalid argument"
-    assert confinement.start(KEY, LimitRule(memory=1e8), in_group) == (-1, (), note)
+    assert finish(confinement.start(KEY, LimitRule(memory=1e8), in_group)) == (-1, (), note)
     with pytest.raises(SpawnError, match="cannot be entered: Invalid argument"):
-        confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started)
+        finish(confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started))
 
 
 @pytest.mark.parametrize("required", [True, False])
@@ -265,10 +270,10 @@ def test_realtime_that_the_kernel_refuses(confinement, required: bool) -> None:
     limits = LimitRule(policy="fifo", priority=40, required=required)
     if required:
         with pytest.raises(SpawnError, match="cannot enforce realtime: /bin/x may not have"):
-            confinement.start(KEY, limits, start)
+            finish(confinement.start(KEY, limits, start))
     else:
         note = "realtime: /bin/x may not have real-time scheduling here"
-        assert confinement.start(KEY, limits, start) == (2**22 + 1, (), note)
+        assert finish(confinement.start(KEY, limits, start)) == (2**22 + 1, (), note)
 
 
 @pytest.mark.parametrize(
@@ -344,7 +349,7 @@ def test_a_fault_before_the_start_does_not_refuse_the_start(confinement, tmp_pat
     confinement.prepare(KEY, limits)  # the control files are missing
     for file in ("memory.max", "memory.oom.group"):
         (top / "camera.1" / file).touch()
-    assert confinement.start(KEY, limits, started).enforced == ("limits.memory",)
+    assert finish(confinement.start(KEY, limits, started)).enforced == ("limits.memory",)
 
 
 def test_an_unlimited_niceness_is_not_missing(tmp_path: Path, monkeypatch) -> None:

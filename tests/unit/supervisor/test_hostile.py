@@ -22,6 +22,7 @@ from rosrm.supervisor import endpoint, instance_record, messages, procfs, spawn
 from rosrm.supervisor.json_lines import ProtocolError, line
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.server import LONGEST_WAIT, Server
+from tests.starting import executed
 from tests.waiting import PATIENCE
 
 TEN_YEARS = 10 * 365.25 * 86400.0
@@ -214,6 +215,7 @@ def test_a_process_that_cannot_exist_is_refused_alone(server, order):
         while not (ended := [i for i in one._core.instances.values() if i.phase != "starting"]):
             assert time.monotonic() < deadline
             one._round()
+            one._take_in(0.1)
         assert ended[0].phase in ("refused", "backoff", "failed")
         assert not one._client.gone
 
@@ -226,7 +228,9 @@ def test_a_reason_names_no_path_of_the_state_directory(server, tmp_path):
     ours, peer = socket.socketpair()
     with peer:
         talk(one, ours, peer, start_fields())
-        one._round()
+        while one._core.instances["a", 1].phase == "starting":
+            one._round()
+            one._take_in(PATIENCE)
     (instance,) = one._core.instances.values()
     assert "'STATE/work' cannot be entered" in instance.message
     assert str(tmp_path) not in instance.message
@@ -288,8 +292,8 @@ def test_limits_of_logs_are_bounded():
 
 def test_a_directory_with_a_null_byte_is_a_spawn_error():
     """`os.chdir` raises `ValueError` for it, not `OSError`."""
-    with pytest.raises(spawn.SpawnError):
-        spawn.spawn(("true",), {}, "/a\0b", 0, 1)
+    with pytest.raises(spawn.SpawnError, match="embedded null byte"):
+        executed(spawn.begin(spawn.Program(("true",), {}, "/a\0b"), 0, 1))
 
 
 def test_a_connection_without_a_free_descriptor_is_closed(server, tmp_path, monkeypatch):

@@ -30,7 +30,8 @@ def ended_leader() -> Stat:
 
 
 def trees(state: str, events: list[object]) -> ProcessTrees:
-    return ProcessTrees(state, selectors.DefaultSelector(), events.append, InstanceGroups())
+    none = InstanceGroups()
+    return ProcessTrees(state, selectors.DefaultSelector(), events.append, none, lambda _: None)
 
 
 def test_a_leader_that_ends_during_the_take_over_is_not_taken_over(tmp_path):

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+import struct
 
 import pytest
 
-from rosrm.supervisor.spawn import SpawnError, find_executable, spawn
+from rosrm.supervisor.spawn import Program, SpawnError, begin, find_executable
+from tests.faults.disks import small_disk
+from tests.starting import executed
 
 
 @pytest.mark.parametrize(
@@ -24,7 +27,7 @@ def test_an_impossible_start_is_explained(argv, environment, directory, said):
     null = os.open(os.devnull, os.O_RDWR)
     try:
         with pytest.raises(SpawnError, match=said):
-            spawn(argv, environment, directory, null, null)
+            executed(begin(Program(argv, environment, directory), null, null))
     finally:
         os.close(null)
 
@@ -39,3 +42,68 @@ def test_a_program_that_was_removed_is_searched_for_again(tmp_path):
     assert find_executable("tool", environment) == str(places[0] / "tool")
     (places[0] / "tool").unlink()
     assert find_executable("tool", environment) == str(places[1] / "tool")
+
+
+def elf(machine: int, loader: bytes = b"") -> bytes:
+    """Return an ELF file for 64 bits and a machine, with a loader."""
+    head = b"\x7fELF\2\1\1".ljust(16, b"\0") + struct.pack("<HHIQQQIHHHHHH", 2, machine, 1, 0x78,
+        64, 0, 0, 64, 56, 1, 0, 0, 0)  # fmt: skip
+    at, size = 120, len(loader) + 1
+    part = struct.pack("<IIQQQQQQ", 3, 4, at, at, at, size, size, 1)
+    return head + part + loader + b"\0"
+
+
+OTHER, OWN = (183, 62) if os.uname().machine == "x86_64" else (62, 183)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (elf(OTHER), "a program for (aarch64|x86_64), and this host is"),
+        (elf(OWN, b"/lib/ld-none.so.1"), "its loader does not exist on this host: '/lib/ld-none"),
+        (b"#!/no/such/python -u\n", "the interpreter in its first line does not exist: '/no/such/"),
+        (b"#!/bin/sh\r\n", r"does not exist: '/bin/sh\\r'; the line ends with a carriage return"),
+        (b"#!\n", "its first line, #!, names no interpreter"),
+        (b"#!/etc/passwd\n", "the interpreter in its first line is not executable: '/etc/passwd'"),
+        (b"echo\n", "neither a program nor a script with #!"),
+        (b"", r"neither a program nor a script with #! \(it is empty\)"),
+        (b"\x7fELF\2\1\1", "damaged"),
+        (None, "it is a directory"),
+    ],
+)
+def test_the_reason_of_a_failed_exec_is_read_from_the_file(tmp_path, content, said):
+    """The error number alone is the same for a missing loader and a missing interpreter."""
+    path = tmp_path / "program"
+    if content is None:
+        path.mkdir()
+    else:
+        path.write_bytes(content)
+        path.chmod(0o755)
+    with pytest.raises(SpawnError, match=said):
+        executed(begin(Program((str(path),), {}, "/"), 0, 1))
+
+
+def test_a_program_without_its_permission_or_target_is_said(tmp_path):
+    """A file without x, a FIFO and a link to nothing have reasons of their own."""
+    plain, fifo, link = tmp_path / "plain", tmp_path / "fifo", tmp_path / "link"
+    plain.write_text("#!/bin/sh\n")
+    os.mkfifo(fifo, 0o755)
+    link.symlink_to("nowhere")
+    said = {
+        plain: "not executable .`chmod",
+        fifo: "no regular file",
+        link: "is a link to 'nowhere'",
+    }
+    for path, reason in said.items():
+        with pytest.raises(SpawnError, match=reason):
+            executed(begin(Program((str(path),), {}, "/"), 0, 1))
+
+
+def test_a_program_on_a_mount_without_exec_is_said(tmp_path):
+    """The mode of the file permits its execution, so the mount is the reason."""
+    with small_disk(tmp_path / "disk", "noexec") as disk:
+        program = disk.place / "program"
+        program.write_text("#!/bin/sh\n")
+        program.chmod(0o755)
+        with pytest.raises(SpawnError, match="mounted with noexec"):
+            executed(begin(Program((str(program),), {}, "/"), 0, 1))
