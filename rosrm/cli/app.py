@@ -43,7 +43,9 @@ def _open_closed_streams() -> None:
 
 def _run(arguments: Sequence[str]) -> None:
     from rosrm.cli import early, parserless  # noqa: PLC0415 - see above
+    from rosrm.cli.output import legible  # noqa: PLC0415 - see above
 
+    legible.never_fail()
     try:
         early.join(early.completed_words(os.environ) or arguments, os.environ)
         command = parserless.command(arguments)

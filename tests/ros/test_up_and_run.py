@@ -162,3 +162,22 @@ def test_a_job_of_the_command_line(make_cluster, tmp_path) -> None:
     assert (process.returncode, said + rest) == (130, "begun\ninterrupted\n")
     assert "cancelling long; Ctrl-C again leaves at once" in errors
     assert cluster.ended("long").state == "cancelled"
+
+
+def test_a_terminal_that_lacks_a_character_ends_nothing(terminal) -> None:
+    """The reason of anybody's job may have it; each command shows its number."""
+    terminal.environment["PYTHONIOENCODING"] = "iso8859-1"
+    work = terminal.file("arrow.yaml", "processes: [{name: odd, kind: job, command: [no→such]}]")
+    with terminal.start("up", work, start_new_session=True) as process:
+        try:
+            said = read_until(process.stdout.fileno(), "odd failed")
+            assert r"no\u2192such" in said, said + process.stderr.read()
+            for command in ("ps --all", "events", "explain odd", "top -n 1"):
+                assert r"no\u2192such" in terminal.run(*command.split())
+            terminal.run("status")
+            assert process.poll() is None
+            os.killpg(process.pid, signal.SIGINT)
+            process.communicate(timeout=PATIENCE)
+            assert process.returncode == 0
+        finally:
+            process.kill()  # without effect on one that has ended

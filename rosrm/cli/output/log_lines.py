@@ -13,11 +13,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from rosrm.cli.output.legible import encoding, legible
 from rosrm.cli.output.log_levels import Level
 from rosrm.cli.output.log_search import LineContext, LineSearch, coloured, is_shown, json_line
 from rosrm.client.logs import LogChunk
 from rosrm.supervisor import log_index
-from rosrm.wording import printable, size
+from rosrm.wording import size
 
 Marks = Sequence[tuple[float, int, int]]
 #: Unix time by which the output was written, and the output; time 0.0: unknown.
@@ -152,10 +153,8 @@ class LogStream:
     def _add(self, text: bytes, when: float = 0.0, level: Level | None = None) -> None:
         """Add a piece, in the colour of a level if one is given."""
         if not self.raw:  # a character may be divided between two pieces
-            shown = self._decoder.decode(text).replace("\r\n", "\n")
-            text = printable(shown).encode()
-        if level is not None:
-            text = coloured(text.decode(), level).encode()
+            shown = legible(self._decoder.decode(text).replace("\r\n", "\n"))
+            text = (shown if level is None else coloured(shown, level)).encode(encoding())
         self._pieces.append((when, text))
         self._at_line_start = text.endswith(b"\n")
 

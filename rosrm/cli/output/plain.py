@@ -1,4 +1,4 @@
-"""Text for the terminal, without control characters: the one place where commands print text.
+"""Text for the terminal, as it can show it: the one place where commands print text.
 
 Names, reasons and messages come from other hosts and other users. Tables go through
 `tables.console`, which does the same.
@@ -12,14 +12,14 @@ from contextlib import contextmanager
 
 import typer
 
+from rosrm.cli.output.legible import legible
 from rosrm.cli.process import INTERRUPTED
 from rosrm.errors import RosrmError
-from rosrm.wording import printable
 
 
 def echo(text: str, *, err: bool = False) -> None:
     """Print a line to standard output, or to standard error."""
-    typer.echo(printable(text), err=err)
+    typer.echo(legible(text, sys.stderr if err else sys.stdout), err=err)
 
 
 @contextmanager

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Final
+from typing import Any, Final
 
 from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
 from rich.table import Table
-from rich.text import Text
+from rich.text import Span, Text
 
+from rosrm.cli.output.legible import legible, offsets
 from rosrm.model.rows import DeviceRow, EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.wording import (
     amount,
@@ -20,7 +21,6 @@ from rosrm.wording import (
     duration,
     listed,
     percent,
-    printable,
     size,
     standing,
     words,
@@ -56,14 +56,35 @@ STYLES: Final = {
 
 
 class PrintableConsole(Console):
-    """Console that shows control characters of texts as numbers (`printable`)."""
+    """Console that shows the characters of texts that a terminal cannot show as numbers."""
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterator[Segment]:
         """Yield the parts of a renderable; control sequences of rich itself stay."""
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=printable(segment.text))
+            text = segment.text
+            yield segment if segment.control else segment._replace(text=legible(text, self.file))
+
+
+class _Table(Table):
+    """Table whose cells are legible before their widths are measured."""
+
+    def add_row(self, *cells: RenderableType | None, **options: Any) -> None:
+        """Add a row of texts."""
+        super().add_row(*map(_legible_cell, cells), **options)
+
+
+def _legible_cell(cell: RenderableType | None) -> RenderableType | None:
+    """Return a cell whose text is legible, in its colours."""
+    text = cell.plain if isinstance(cell, Text) else cell
+    if not isinstance(text, str) or (shown := legible(text)) == text:
+        return cell
+    if not isinstance(cell, Text):
+        return shown
+    at = offsets(text)
+    spans = [Span(at[start], at[end], style) for start, end, style in cell.spans]
+    return Text(shown, cell.style, spans=spans)
 
 
 def console() -> Console:
@@ -76,7 +97,7 @@ def console() -> Console:
 
 def table(*columns: str, right: Sequence[str] = ()) -> Table:
     """Return an empty table; the columns in `right` have numbers, aligned at the right."""
-    made = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", show_edge=False)
+    made = _Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold", show_edge=False)
     for column in columns:
         number = column in right
         made.add_column(
@@ -228,6 +249,6 @@ def event(row: EventRow) -> Table:
 
 def entry(when: str, kind: str, message: str) -> Table:
     """Return time, kind and message of an event; a long message wraps with a hanging indent."""
-    made = Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
+    made = _Table.grid(padding=(0, 1, 0, 0), pad_edge=False)
     made.add_row(Text(f"{when} "), Text(f"{words(kind):<18}"), Text(message))
     return made

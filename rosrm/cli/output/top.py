@@ -19,6 +19,7 @@ from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.text import Text
 
 from rosrm.cli.output import tables
+from rosrm.cli.output.legible import legible
 from rosrm.model.rows import HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.wording import duration, percent, size, words
 
@@ -213,7 +214,8 @@ def _processes(
     if not processes:
         yield Text("no process", "dim")
         return
-    shown = sorted(processes, key=SORTS[sort])[:most]
+    first = sorted(processes, key=SORTS[sort])[:most]
+    shown = [replace(row, reason=legible(row.reason)) for row in first]
     cells = {
         "NAME": [Text(row.name) for row in shown],
         "STATE": [tables.state(row.state) for row in shown],

@@ -198,8 +198,9 @@ def interrupt():
 def rosrm():
     """Run one command line; return both streams and the exit code."""
 
-    def run(*words, columns=None):
-        runner = CliRunner(env={"COLUMNS": columns, "NO_COLOR": "1", "TERM": "dumb"})
+    def run(*words, columns=None, charset="utf-8"):
+        environment = {"COLUMNS": columns, "NO_COLOR": "1", "TERM": "dumb"}
+        runner = CliRunner(charset, environment)
         result = runner.invoke(app, [str(word) for word in words], prog_name="rosrm")
         return SimpleNamespace(code=result.exit_code, out=result.stdout, err=result.stderr)
 

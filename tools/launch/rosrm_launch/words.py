@@ -52,7 +52,7 @@ class RosArguments:
 def sections_in(path: Path) -> tuple[Parameters, ...]:
     """Return the sections of a parameters file; raises `ValueError` if it is none."""
     try:
-        return _sections(path.read_text())
+        return _sections(path.read_text(encoding="utf-8"))
     except ValueError as error:
         raise ValueError(f"parameters file {path}: {error}") from None
 
