@@ -6,10 +6,10 @@ Only pydantic calls these hooks, when it validates a file. So the settings do no
 from __future__ import annotations
 
 import json
-import re
-import shlex
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
+
+from rosrm.config.shell_words import shell_words
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,13 @@ class PlainWord:
 
 @dataclass(frozen=True)
 class Words:
-    """Annotation of a list of words, or of one text that is split by the rules of a shell."""
+    """Annotation of a list of words, or of one text that is split by the rules of a shell.
+
+    Attributes:
+        program: the first word is a program.
+    """
+
+    program: bool = False
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that splits a text into words."""
@@ -140,36 +146,14 @@ class Words:
 
         return core_schema.no_info_before_validator_function(self.split, handler(source))
 
-    @staticmethod
-    def split(given: Any) -> Any:
+    def split(self, given: Any) -> Any:
         """Return a text or list as words; any other value unchanged.
 
         Raises:
-            ValueError: the text cannot be split, or has shell syntax outside quotes.
+            ValueError: the text cannot be split, or a shell would do more than split it.
         """
         if not isinstance(given, str):
             return tuple(given) if isinstance(given, list) else given
         if "$(find-pkg-" in given:
             raise ValueError(f"{given!r}: write a list of words where a package is named by $(…)")
-        try:
-            words = tuple(shlex.split(given))
-        except ValueError as error:
-            raise ValueError(f"{given!r} cannot be split into words: {error}") from None
-        found = _SHELL_SYNTAX.search(_QUOTED.sub(_blank, given))
-        if found:
-            raise ValueError(
-                f"{given!r} has {found[0].strip()!r} outside quotes, and no shell reads it. Write "
-                f"[bash, -c, {json.dumps(given)}] for a shell, or quote {found[0].strip()!r} to "
-                "pass it to the program as it is"
-            )
-        return words
-
-
-#: Quoted and escaped parts of a text.
-_QUOTED: Final = re.compile(r"""\\.|'[^']*'|"(?:\\.|[^"\\])*\"""", re.DOTALL)
-#: Syntax that a shell would interpret, including `~` at the start of an argument.
-_SHELL_SYNTAX: Final = re.compile(r"&&|\|\||>>|<<|[|&;<>`*]|\$[\w{(]+|(?<=\s)~(?=/|\s|$)")
-
-
-def _blank(quoted: re.Match[str]) -> str:
-    return "_" * len(quoted[0])
+        return shell_words(given, program=self.program)

@@ -67,6 +67,7 @@ Name = Annotated[str, PlainWord(boolean=False)]
 Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
 _Value = TypeVar("_Value")
 ListOfWords = Annotated[tuple[Text, ...], Words()]
+_CommandLine = Annotated[tuple[Text, ...], Words(program=True)]
 _CpuNumber = Annotated[int, Quantity(high=LARGEST_CPU_NUMBER, whole=True)]
 
 
@@ -269,8 +270,8 @@ class ProcessInFile:
     package: str | None = None
     executable: str | None = None
     module: str | None = None
-    command: ListOfWords = ()
-    prefix: ListOfWords = ()
+    command: _CommandLine = ()
+    prefix: _CommandLine = ()
     arguments: ListOfWords = ()
     parameters: Annotated[Mapping[str, Any] | tuple[ParameterSource, ...], ParametersInFile()] = (
         field(default_factory=lambda: EMPTY)

@@ -525,7 +525,7 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, command: x, kind: jobs", """kind: "jobs" is unknown; did you mean 'job'?"""),
         ("name: a, command: x, priority: high", "priority: 'high' is not a whole number"),
         ("name: a, command: x, needs: {memory: lots}", "needs.memory: 'lots' is not a number"),
-        ('name: a, command: "echo \'x"', "cannot be split into words: No closing quotation"),
+        ('name: a, command: "echo \'x"', "cannot be split into words: it has no closing '"),
         ("name: a, comand: x", "unknown key 'comand'; did you mean 'command'?"),
         ("name: a, command: x, hosts: [b]", "unknown key 'hosts'; did you mean 'labels'?"),
         ("name: a, command: x, cwd: /b", "unknown key 'cwd'; did you mean 'working_directory'?"),
@@ -625,6 +625,11 @@ def test_a_relative_program_or_directory_is_beside_the_file(
         ("echo `date`", "`"),
         ("python3 ~/brain.py", "~"),
         ("sleep 600 &", "&"),
+        ("play # loudly", "#"),
+        ("echo $$", "$$"),
+        ("play {a,b}.bag", "{a,b}"),
+        ("play {1..3}", "{1..3}"),
+        ("play (a)", "("),
     ],
 )
 def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
@@ -637,8 +642,32 @@ def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
 
 
 @pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("|\n      echo a\n      echo b\n", "has several lines, and a command has one"),
+        ("|\n      echo a \\\n      b\n", "has several lines"),
+        ('|\n      echo "a \\\n      b"\n', "has several lines"),
+        ("RATE=3 play", "begins with 'RATE=', and only a shell sets a variable so"),
+        ("cd /tmp", "begins with 'cd', a command of shells and no program"),
+        ("'echo \"$HOME/x\"'", "has '$HOME' in double quotes, where a shell would replace it"),
+        ("'echo \"`date`\"'", "has '`' in double quotes"),
+    ],
+)
+def test_what_only_a_shell_would_do_with_a_command_is_refused(refusal, text, said):
+    """The program would get other words than the user means; a remedy is given."""
+    message = refusal(load_work, f"processes:\n  - name: a\n    command: {text}")
+    assert said in message
+    assert "Write [bash, -c, " in message or "Write it on one line" in message
+
+
+@pytest.mark.parametrize(
     ("given", "words"),
     [
+        ("|\n      echo a\n", ("echo", "a")),
+        (">\n      echo\n      a\n", ("echo", "a")),
+        ("|\n      sh -c 'echo a\n      echo b'\n", ("sh", "-c", "echo a\necho b")),
+        ("'sh -c \"echo \\$1\"'", ("sh", "-c", "echo $1")),
+        ("play x_{name} rate:=3 a=b", ("play", "x_{name}", "rate:=3", "a=b")),
         ("'bash -c \"cd /tmp && echo $HOME\"'", ("bash", "-c", "cd /tmp && echo $HOME")),
         ("[echo, a && b, $HOME, ~/state]", ("echo", "a && b", "$HOME", "~/state")),
         ("\"grep 'a|b*' log\"", ("grep", "a|b*", "log")),
