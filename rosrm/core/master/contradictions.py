@@ -11,14 +11,18 @@ from rosrm.model.values import ProcessSpec
 _Specs = Mapping[str, ProcessSpec]
 
 
-def neighbour_fault(state: MasterState, submitted: Sequence[ProcessSpec]) -> str:
-    """Return a sentence on a rule that can never be kept, with both sides; "": none is known."""
+def neighbour_fault(state: MasterState, submitted: Sequence[ProcessSpec], owner: str) -> str:
+    """Return a sentence on a rule that can never be kept, with both sides; "": none is known.
+
+    Args:
+        owner: owner of the submitted processes. Rules of others about them do not count.
+    """
     if not state.neighbours.declared and not any(spec.neighbours for spec in submitted):
         return ""
-    return contradiction_in(_tied(state, {spec.name: spec for spec in submitted}))
+    return contradiction_in(_tied(state, {spec.name: spec for spec in submitted}, owner))
 
 
-def _tied(state: MasterState, submitted: _Specs) -> _Specs:
+def _tied(state: MasterState, submitted: _Specs, owner: str) -> _Specs:
     """Return the submitted processes and those that rules "near" tie to one of them."""
     specs, open_names = dict(submitted), list(submitted)
     named: dict[str, list[str]] = {}
@@ -36,8 +40,12 @@ def _tied(state: MasterState, submitted: _Specs) -> _Specs:
             specs[name] = known.spec
         open_names += _near(specs[name]) if name in specs else ()
         open_names += named.get(name, ())
-        about = (state.processes[other].spec for other in state.neighbours.about.get(name, ()))
-        open_names += [spec.name for spec in about if name in _near(spec)]
+        principal = owner if name in submitted or known is None else known.principal
+        about = (state.processes[other] for other in state.neighbours.about.get(name, ()))
+        open_names += [
+            one.name for one in about
+            if name in _near(one.spec) and (one.by_operator or one.principal == principal)
+        ]  # fmt: skip
     live = {name: spec for name, spec in specs.items() if name not in submitted}
     return {**live, **submitted}
 

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from graphlib import TopologicalSorter
 
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.rights import may_affect
 from rosrm.core.master.state.process import DesiredState, Process
 from rosrm.wording import listed
 
@@ -37,11 +38,20 @@ def dependants_first(state: MasterState, processes: Sequence[Process]) -> list[P
     return [named[name] for name in TopologicalSorter(before).static_order()]
 
 
+def binding_dependants(state: MasterState, process: Process) -> list[str]:
+    """Return the dependants that hold back the stop and the removal of a process.
+
+    Those of other users do not, unless the user is an operator.
+    """
+    names = state.start_orders.dependants.get(process.name, ())
+    return [name for name in names if may_affect(state.processes[name], process)]
+
+
 def awaited_ends(state: MasterState, process: Process) -> list[str]:
     """Return the names of the processes that must end before a cancelled process is stopped."""
-    dependants = state.start_orders.dependants.get(process.name)
-    if dependants is None or process.wanted is not DesiredState.CANCEL:
+    if process.wanted is not DesiredState.CANCEL:
         return []
+    dependants = binding_dependants(state, process)
     return [name for name in dependants if state.processes[name].wanted is DesiredState.CANCEL]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from rosrm.core.master.dependants import binding_dependants
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.applications import Application
 from rosrm.core.master.state.intents import version_intent
@@ -30,7 +31,7 @@ def is_gone(state: MasterState, process: Process) -> bool:
     Neither an instance nor a standby of it may run, no live process starts after it, and it is no
     finished job that its application still wants: without it, the job would run again.
     """
-    is_used = process.name in state.start_orders.dependants or is_wanted_job(state, process)
+    is_used = binding_dependants(state, process) or is_wanted_job(state, process)
     return not state.may_run(process) and not is_used
 
 

@@ -7,6 +7,7 @@ from typing import Final
 from rosrm.core.master import events as happened
 from rosrm.core.master import lifecycle
 from rosrm.core.master.commands import Reply
+from rosrm.core.master.dependants import binding_dependants
 from rosrm.core.master.garbage import (
     is_gone,
     is_wanted_job,
@@ -90,8 +91,7 @@ def _why_not_pruned(state: MasterState, process: Process) -> str:
     if process.instances:
         instance = state.instances[min(process.instances)]
         return f"{instance.id} is still being stopped on {instance.host.name}"
-    if process.name in state.start_orders.dependants:
-        names = list(state.start_orders.dependants[process.name])
+    if names := binding_dependants(state, process):
         after = f"{each_of(names)} starts after {process.name}, and has not ended"
         return f"{after}; cancel {listed(names)} first"
     if is_wanted_job(state, process):

@@ -10,6 +10,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.adoption import check_adoption
 from rosrm.core.master.assignment.assign import assign_to_adopt, reconsider_set_aside
 from rosrm.core.master.assignment.gangs import check_gangs
+from rosrm.core.master.assignment.neighbours import running_with
 from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.checkpoint import image_requests
 from rosrm.core.master.commands import Reply
@@ -64,7 +65,9 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{taken}. Nothing was queued", "name_taken")
     filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
     specs = [spec for spec, _ in filled]
-    fault = submission_fault(state, filled, len(filled)) or neighbour_fault(state, specs)
+    fault = submission_fault(state, filled, len(filled)) or neighbour_fault(
+        state, specs, event.by.name
+    )
     fault = fault or start_order_fault(state, specs)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
@@ -105,7 +108,7 @@ def add_process(
         by: its owner from now on.
     """
     process = Process(
-        spec, state.next_order, ProcessPhase.QUEUED, now, by.name, wall=state.wall,
+        spec, state.next_order, ProcessPhase.QUEUED, now, by.name, by.is_operator, wall=state.wall,
         born=state.next_instance, owned_from=_owned_from(state, spec.name, by),
         defaulted=defaulted, awaits_gang=bool(spec.together),
     )  # fmt: skip
@@ -395,6 +398,7 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
     """Begin the migration of a process."""
     (process,) = known_processes(state, [event.name], event.by)
     host = None if event.host is None else known_host(state, event.host)
+    check_rights(running_with(state, process), event.by)
     rejected = try_move(state, process, _cause(event.by), now, host=host)
     if rejected is not None:
         _note_refused_move(state, process, rejected.reason, now)

@@ -1,4 +1,9 @@
-"""Rights on processes: an owner may act on its own processes, an operator on all."""
+"""Rights on processes: an owner may act on its own processes, an operator on all.
+
+`check_rights` is for requests, `may_affect` for what a process causes by its spec: its neighbour
+rules, its dependencies, its flows and its priority affect no process on which its owner could not
+act by a request.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,11 @@ from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.state.process import Process
 from rosrm.model.requester import Requester
 from rosrm.wording import few, listed
+
+
+def may_affect(process: Process, other: Process) -> bool:
+    """Return True if the spec of a process may move, stop or hold back another process."""
+    return process.by_operator or process.principal == other.principal
 
 
 def check_rights(processes: Iterable[Process], by: Requester) -> None:

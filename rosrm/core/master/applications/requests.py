@@ -105,7 +105,7 @@ def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> l
     for target, version in zip(targets, versions, strict=True):
         specs: Mapping[str, ProcessSpec] = {} if version is None else version.specs
         application = state.applications.get(target.application)
-        known = application or Application(target.application, by.name)
+        known = application or Application(target.application, by.name, by.is_operator)
         _check_names(state, known, specs, by)
         own = state.names_of(target.application)
         found = differences(state, target.application, specs, own)
@@ -230,7 +230,7 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
         for name, difference in one.found.items()
         if difference.action is Action.START
     ]
-    fault = submission_fault(state, changed, len(started)) or neighbour_fault(state, specs)
+    fault = submission_fault(state, changed, len(started)) or neighbour_fault(state, specs, by.name)
     fault = fault or _start_order_fault(state, prepared)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
@@ -261,7 +261,7 @@ def _note_change(state: MasterState, one: Prepared, by: Requester, now: float) -
     application, version = state.applications.get(one.application.name), one.version
     if application is None:
         application = state.applications[one.application.name] = Application(
-            one.application.name, by.name
+            one.application.name, by.name, by.is_operator
         )
     number = one.number
     if number == application.wanted and not one.found and not application.paused:

@@ -152,7 +152,8 @@ def _advance_ended(
     _begin(state, application, task)
     version = application.version
     defaulted = version.defaulted.get(spec.name, ()) if version is not None else ()
-    add_process(state, spec, defaulted, Requester(application.principal), now)
+    owner = Requester(application.principal, is_operator=application.by_operator)
+    add_process(state, spec, defaulted, owner, now)
     return False
 
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from rosrm.core.master.assignment.neighbours import host_of
+from rosrm.core.master.assignment.neighbours import binds, host_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.scheduling.traffic import rates, round_trips
 from rosrm.core.master.state.demand import NO_TRAFFIC, Flow, Traffic
@@ -47,7 +47,8 @@ def traffic_of(
 
 def _flows(state: MasterState, name: str, together: AbstractSet[str]) -> Iterator[Flow]:
     for other in state.flows.partners[name]:
-        host, flow = _host(state, other), state.flows.between(name, other)
+        bound = binds(state, other, name)
+        host, flow = _host(state, other), state.flows.between(name, other, bound=bound)
         if host is not None and other not in together and flow.rate > 0.0:
             yield Flow(other, host.name, host.column, flow.rate, flow.incoming, flow.learned)
 

@@ -3,6 +3,9 @@
 A rule "near" without a label ties processes to one host: they are placed, and move, together. A
 process waits until each process near which it must run has a host. If some wait for each other, by
 these rules or by their start orders, the first of them in the queue that may start does not wait.
+
+A rule binds the process that declares it. Other processes are bound only if the owner of the
+declaring process may act on them; otherwise a rule would move or hold back processes of others.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ from collections.abc import Set as AbstractSet
 from typing import Final
 
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.rights import may_affect
 from rosrm.core.master.scheduling.proximity import same_place
 from rosrm.core.master.state.demand import Neighbour
 from rosrm.core.master.state.hosts import Host
@@ -79,9 +83,18 @@ def _near_of_others(
 def _rules_about(
     state: MasterState, declaring: str, name: str, relation: str
 ) -> Iterator[NeighbourRule]:
+    """Return the rules of one process that bind another one."""
+    if not binds(state, declaring, name):
+        return
     for rule in state.neighbours.declared[declaring]:
         if rule.relation == relation and name in rule.processes:
             yield rule
+
+
+def binds(state: MasterState, declaring: str, name: str) -> bool:
+    """Return True if the rules of one process bind another one, or will once that one exists."""
+    process, other = state.processes.get(declaring), state.processes.get(name)
+    return process is None or other is None or may_affect(process, other)
 
 
 def host_of(state: MasterState, name: str) -> tuple[Host | None, str]:
@@ -199,7 +212,7 @@ def _tied_to(state: MasterState, process: Process) -> Iterator[str]:
     """Return the names in the rules of a process that tie to one host, and in those about it."""
     for rule in process.spec.neighbours:
         if _ties(rule):
-            yield from rule.processes
+            yield from (name for name in rule.processes if binds(state, process.name, name))
     for other in state.neighbours.about.get(process.name, ()):
         if any(_ties(rule) for rule in _rules_about(state, other, process.name, "near")):
             yield other
@@ -234,7 +247,8 @@ def _places_apart(state: MasterState, process: Process) -> _Places:
         own = found[rule.by, rule.prefer]  # a label is required even without others
         own.update(_instances_at(state, process, rule.processes))
         for theirs, members in state.neighbours.groups.get(rule.group, _NO_MEMBERS).items():
-            at = _instances_at(state, process, members)
+            binding = [name for name in members if binds(state, name, process.name)]
+            at = _instances_at(state, process, binding)
             own.update(at)
             if found[theirs] is not own:
                 found[theirs].update(at)

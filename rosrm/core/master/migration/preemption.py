@@ -2,9 +2,10 @@
 
 They move to other hosts. With `preemption: requeue`, those that cannot move wait in the queue
 again. The set with the fewest processes is chosen; of equal sets the one with the lowest
-priorities. Until the process is placed, its host takes no process of a lower priority; otherwise
-that one could take the room. Such a claim ends with the placement, when the process does not fit in
-spite of the room, or at its deadline.
+priorities. Processes of other users make room only for a process of an operator, because another
+owner could not stop them by a request. Until the process is placed, its host takes no process of a
+lower priority; otherwise that one could take the room. Such a claim ends with the placement, when
+the process does not fit in spite of the room, or at its deadline.
 
 A set is a union of groups: processes that must stay on one host leave it together.
 """
@@ -34,6 +35,7 @@ from rosrm.core.master.migration.room import (
 from rosrm.core.master.migration.start import may_begin
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.recovery.journal_gap import why_no_work
+from rosrm.core.master.rights import may_affect
 from rosrm.core.master.scheduling.candidates import candidates
 from rosrm.core.master.scheduling.filters import FILTERS, OF_ROOM, passing
 from rosrm.core.master.scheduling.ranking import Ranking
@@ -356,6 +358,8 @@ def _groups(state: MasterState, search: _Search, host: Host, now: float) -> Iter
 
 def _why_it_stays(state: MasterState, search: _Search, process: Process, now: float) -> str:
     """Return why a process does not make room; "" if it may."""
+    if not may_affect(search.process, process):
+        return f"{process.name} belongs to another user"
     if process.spec.priority >= search.process.spec.priority:
         return f"{process.name} has no lower priority ({process.spec.priority})"
     if process.spec.protect:

@@ -66,6 +66,7 @@ class Application:
     """One application.
 
     Attributes:
+        by_operator: its owner was an operator when it made the application.
         versions: kept versions by number, in order.
         wanted: number of the desired version; 0: none, the application is cancelled.
         former: number of the version to which a failed replacement returns; 0: none.
@@ -77,6 +78,7 @@ class Application:
 
     name: str
     principal: str
+    by_operator: bool = False
     versions: dict[int, Version] = field(default_factory=dict)
     wanted: int = 0
     former: int = 0
@@ -107,7 +109,9 @@ class Application:
 
 
 #: Fields that are journaled unchanged.
-_APPLICATION: Final = ("principal", "wanted", "former", "returning", "paused", "newest")
+_APPLICATION: Final = (
+    "principal", "by_operator", "wanted", "former", "returning", "paused", "newest",
+)  # fmt: skip
 _TASK: Final = ("replaces", "begun", "fault")
 _VERSION: Final = ("number", "defaulted", "rollout", "wall", "by", "note", "given_up")
 

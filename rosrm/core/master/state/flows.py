@@ -84,13 +84,16 @@ class Flows:
         for other in self.partners.get(name, ()):
             self.changed[pair_of(name, other)] = None
 
-    def between(self, name: str, other: str) -> Partner:
+    def between(self, name: str, other: str, *, bound: bool = True) -> Partner:
         """Return the flow between two processes.
 
         What a spec declares replaces what was learned. If both declare a rate, the greater counts.
+
+        Args:
+            bound: False ignores what the other process declares.
         """
         own = self.declared.get(name, EMPTY).get(other)
-        theirs = self.declared.get(other, EMPTY).get(name)
+        theirs = self.declared.get(other, EMPTY).get(name) if bound else None
         if own is not None and own >= (theirs or 0.0):
             return Partner(own, True)
         if theirs is not None:

@@ -205,7 +205,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on", "next_run", "restart_due", "cancel_cause", "awaits_gang",
+    "failed_on", "next_run", "restart_due", "cancel_cause", "awaits_gang", "by_operator",
 )  # fmt: skip
 
 
@@ -217,6 +217,7 @@ class Process:
         next_spec: spec with which it is started again once its instances have ended; None: `spec`.
         order: place in the queue; unchanged when the process returns to the queue.
         principal: owner, the user that submitted the process, "user:ada"; "": unknown.
+        by_operator: its owner was an operator at the submission: its spec may affect every process.
         since: start of its phase by this master's clock; earlier than the master's own start if the
             phase is from the journal.
         wall: unix time of the start of its phase.
@@ -265,6 +266,7 @@ class Process:
     phase: ProcessPhase
     since: float
     principal: str = ""
+    by_operator: bool = False
     wanted: DesiredState = DesiredState.RUN
     owner: int = 0
     instances: set[int] = field(default_factory=set)
