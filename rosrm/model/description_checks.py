@@ -7,6 +7,7 @@ import re
 from typing import Final, get_args
 
 from rosrm.model.devices import device_fault
+from rosrm.model.sizes import size_of
 from rosrm.model.values import (
     RESOURCE_SLOTS,
     Accounting,
@@ -22,6 +23,8 @@ _NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
 _RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 #: Seconds: the longest period of readings.
 _LONGEST_PERIOD: Final = 3600.0
+#: Most letters and entries in the description of a host, of which every listing has a part.
+LARGEST_DESCRIPTION: Final = 1 << 16
 _ACCOUNTINGS: Final = get_args(Accounting)
 #: Examples of fields in the description of a resource.
 _EXAMPLES: Final = {"unit": '"B", "core", "B/s" or "1"', "scope": '"machine"'}
@@ -96,10 +99,21 @@ def description_fault(description: HostDescription) -> str:
     unprintable = next((word for word in words if not word.isprintable()), None)
     if unprintable is not None:
         return f"{description.name} has {unprintable!r:.200} in its description: no printable text"
-    fault = next(filter(None, map(resource_fault, resources)), "")
+    fault = _size_fault(description) or next(filter(None, map(resource_fault, resources)), "")
     if not fault and (wrong := device_fault(description.devices)):
         fault = f"has devices that no host can have: {wrong}"
     return fault and f"{description.name} {fault}"
+
+
+def _size_fault(description: HostDescription) -> str:
+    """Return why a description is too large, as a predicate; "": it is not."""
+    size = size_of(description)
+    if size <= LARGEST_DESCRIPTION:
+        return ""
+    return (
+        f"has a description (labels, devices, plugins, reasons) of {size} letters and entries; "
+        f"at most {LARGEST_DESCRIPTION}"
+    )
 
 
 def resource_fault(resource: object) -> str:

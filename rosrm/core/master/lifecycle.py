@@ -19,10 +19,11 @@ from rosrm.core.master.rescheduling import next_attempt, note_run
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.learned_needs import NO_NEEDS
 from rosrm.core.master.state.migration import End, Migration
-from rosrm.core.master.state.process import WAITING, DesiredState, Instance, Process, ProcessPhase
+from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import FenceInstance, Order, ReportInstances, StopInstance
 from rosrm.model.plan import Start
+from rosrm.model.sizes import size_of
 from rosrm.model.values import (
     LARGEST_NUMBER,
     InstanceId,
@@ -54,6 +55,10 @@ _EVENT: Final = {
     ProcessPhase.FAILED: EventKind.FAILED,
     ProcessPhase.CANCELLED: EventKind.CANCELLED,
 }
+#: Most instances of one host that the master has not assigned to it, and tracks until they end.
+_MOST_STRAYS: Final = 256
+#: Most letters and entries of the status of an instance.
+_LARGEST_STATUS: Final = 10_000
 #: Reported states that show that the slave has begun to restart the instance.
 _RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
 #: Reported states in which nothing of the instance runs, and so the readings do not show it.
@@ -115,6 +120,13 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
     )
 
 
+def _bounded(status: InstanceStatus) -> InstanceStatus:
+    """Return a status without what an honest slave does not send: endless texts and lists."""
+    if size_of(status) <= _LARGEST_STATUS:
+        return status
+    return replace(status, message=status.message[:_LARGEST_STATUS], enforced=(), devices=())
+
+
 def _note_load(
     state: MasterState, instance: Instance, before: InstanceState | None, now: float
 ) -> None:
@@ -132,6 +144,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     if instance is None or instance.host is not host or instance.id != status.instance:
         _handle_unknown_instance(state, host, status, now)
         return
+    status = _bounded(status)
     before, pid = instance.state, instance.pid
     instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
     instance.message, instance.enforced = status.message, status.enforced
@@ -243,7 +256,9 @@ def _handle_unknown_instance(
 ) -> None:
     """Stop an instance that is not assigned to its host, because it may have a successor elsewhere.
 
-    The master tracks it until it has ended: it repeats the order to stop, and starts no successor.
+    The master tracks it until it has ended, and repeats the order to stop. A process of its name
+    waits for that end, but not for ever: `start_order.review`. Beyond `_MOST_STRAYS` of one host,
+    the master only orders the stop at each report, so that no host fills the master's memory.
     """
     if readoption.readopt(state, host, status, now):
         take_status(state, host, status, now)
@@ -255,6 +270,13 @@ def _handle_unknown_instance(
         if status.state is not InstanceState.STOPPING:
             state.send(host, StopInstance(status.instance))
         return
+    if sum(state.instances[number].stray for number in host.instances) >= _MOST_STRAYS:
+        state.record_seldom(
+            host, EventKind.UNASSIGNED_STOPPED, now,
+            f"{host.name} reports more than {_MOST_STRAYS} instances that are not assigned to it",
+        )  # fmt: skip
+        state.send(host, StopInstance(status.instance))
+        return
     followed = readoption.has_successor(state, status)
     how = "fences it: another instance owns its name" if followed else "stops it"
     state.record(
@@ -262,19 +284,19 @@ def _handle_unknown_instance(
         f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
-    unknown = adopt_to_stop(state, status.instance, host, now)
+    unknown = adopt_to_stop(state, status.instance, host, now, stray=True)
     state.note_held(unknown, status.devices)
     unknown.state, unknown.pid = status.state, status.pid
     unknown.at_once = followed
     stop_instance(state, unknown, now)
-    process = state.processes.get(status.instance.process)
-    if process is not None and process.phase in WAITING:
-        _wait_for_ends(state, process, now)
+    state.start_orders.to_review[status.instance.process] = None
 
 
-def adopt_to_stop(state: MasterState, instance: InstanceId, host: Host, now: float) -> Instance:
+def adopt_to_stop(
+    state: MasterState, instance: InstanceId, host: Host, now: float, *, stray: bool = False
+) -> Instance:
     """Track an instance until it has stopped; reserve nothing, because readings show its usage."""
-    adopted = state.add_instance(instance, host, now, NO_NEEDS)
+    adopted = state.add_instance(instance, host, now, NO_NEEDS, stray=stray)
     adopted.stopping = True
     return adopted
 
@@ -302,7 +324,7 @@ def _ended(
 ) -> None:  # fmt: skip
     process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
-    if process is None:
+    if process is None or instance.stray:
         return
     learn_from(state, process.spec, instance, status)
     learn_run_time(state, process.spec, status)
@@ -496,7 +518,7 @@ def gone(
     """
     process = state.processes.get(instance.id.process)
     state.drop_instance(instance)
-    if process is None:
+    if process is None or instance.stray:
         return
     status = InstanceStatus(instance.id, InstanceState.FAILED, exit_code=1, message=reason)
     end = End(status, gone=requeue)

@@ -94,7 +94,8 @@ class MasterState:
         held_since: time since when placement waits for first requests for work; inf: no wait.
         contact_since: time since when at least one host reports; inf: none does.
         next_loss: time at which the next host is lost, unless it reports before; inf: none is.
-        unowned_instances: name of a removed process to its instances that may still run.
+        strays: process name to the numbers of the instances that a host reports although the master
+            has not assigned them to it. They are stopped, and give the host no right.
         capability_answers: answers of hosts, by strategy and host, for each strategy that must
             check its hosts.
         chain_of: creates the scoring policies with other settings; None: they stay.
@@ -148,7 +149,7 @@ class MasterState:
         self.chain_of: ChainOf | None = None
         self.scoring: tuple[PolicySettings, ...] = ()
         self.scoring_in_force: tuple[PolicySettings, ...] = ()
-        self.unowned_instances: dict[str, set[int]] = {}
+        self.strays: dict[str, set[int]] = {}
         self.rankings: dict[RankingKey, Ranking] = {}
         self.rankings_version = 0
         self.placed_at: tuple[int, ...] = ()
@@ -380,7 +381,7 @@ class MasterState:
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue, process.cancel_cause = DesiredState.RUN, False, ""
         process.started_at, process.began = inf, 0.0
-        process.restart_due = False
+        process.restart_due, process.strays_until = False, 0.0
         self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
         self.put_in_queue(process)
@@ -404,6 +405,8 @@ class MasterState:
     def _put_in_queue(self, process: Process) -> None:
         self.queue.add(process.name, process.spec.priority, process.order)
         self.start_orders.note_change(process.name)
+        if process.name in self.strays:
+            self.start_orders.to_review[process.name] = None
         if process.queue_delay:
             self.queue.delayed.add(process.name)
 
@@ -461,33 +464,37 @@ class MasterState:
         """Return the needs of one instance of a spec."""
         return self.learned.estimate(spec, self.settings.default_needs)
 
-    def _numbers_of(self, name: str) -> set[int]:
-        """Return the instance numbers of a name, also if its process was removed."""
-        process = self.processes.get(name)
-        if process is not None:
-            return process.instances
-        return self.unowned_instances.setdefault(name, set())
+    def _numbers_with(self, instance: Instance) -> set[int]:
+        """Return the instance numbers of a process, or those of its strays."""
+        name = instance.id.process
+        if instance.stray:
+            return self.strays.setdefault(name, set())
+        return self.processes[name].instances
 
     def add_instance(
         self, instance: InstanceId, host: Host, now: float, needs: Estimate | Demand,
         fractions: FloatArray | None = None, *, devices: tuple[HeldDevice, ...] = (),
+        stray: bool = False,
     ) -> Instance:  # fmt: skip
         """Add an instance, and reserve its needs and devices on its host.
 
-        `fractions`, (R,): the needs as shares of the host's capacity, where they are known already.
+        Args:
+            fractions: (R,) needs as shares of the host's capacity, where they are known already.
+            stray: the master has not assigned it to this host.
         """
         if fractions is None:
             fractions = self.hosts.fractions_of(host, needs.amounts, needs.estimated)
         reserved = np.where(fractions < np.inf, fractions, 0.0)
         added = Instance(
-            instance, host, now, needs.amounts, needs.estimated, reserved, devices=devices
-        )
+            instance, host, now, needs.amounts, needs.estimated, reserved, devices=devices,
+            stray=stray,
+        )  # fmt: skip
         self.hosts.hold(host, instance, devices)
         self.instances[instance.number] = added
         process = self.processes.get(instance.process)
         spec = process.spec if process is not None else ProcessSpec(instance.process)
         host.instances[instance.number] = instance.process, spec
-        self._numbers_of(instance.process).add(instance.number)
+        self._numbers_with(added).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
         self.note_change(instance.process)
         return added
@@ -542,9 +549,11 @@ class MasterState:
         del self.instances[instance.id.number]
         instance.host.instances.pop(instance.id.number, None)
         name = instance.id.process
-        self._numbers_of(name).discard(instance.id.number)
-        if not self.unowned_instances.get(name, True):
-            del self.unowned_instances[name]
+        self._numbers_with(instance).discard(instance.id.number)
+        if instance.stray:
+            self.start_orders.to_review[name] = None
+            if not self.strays[name]:
+                del self.strays[name]
         if instance.devices and not self._may_return(instance):
             self.hosts.hold(instance.host, instance.id, ())
         self.hosts.add_reservation(instance.host, -instance.reserved, processes=-1)

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import islice
+from typing import Final
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.extensions.plugin_calls import TITLES, Failing, Plugin
 from rosrm.model.event_kinds import EventKind
+from rosrm.wording import sanitized
+
+#: Most failing plugins of a host that count, and most letters of a name or a reason.
+_MOST_FAILING: Final = 64
+_LONGEST_ERROR: Final = 1000
 
 
 def note(state: MasterState, now: float) -> None:
@@ -28,6 +35,11 @@ def note_on_host(state: MasterState, host: Host, failing: Mapping[Plugin, str], 
     Args:
         failing: every failing plugin to the reason; a probe has the name of its resource.
     """
+    failing = {
+        (kind, name): sanitized(error, _LONGEST_ERROR)
+        for (kind, name), error in islice(failing.items(), _MOST_FAILING)
+        if len(name) <= _LONGEST_ERROR
+    }
     for plugin in sorted(failing.keys() | host.failing.keys()):
         if plugin not in failing:
             del host.failing[plugin]

@@ -65,10 +65,11 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{taken}. Nothing was queued", "name_taken")
     filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
     specs = [spec for spec, _ in filled]
-    fault = submission_fault(state, filled, len(filled)) or neighbour_fault(
-        state, specs, event.by.name
+    fault = (
+        submission_fault(state, filled, len(filled))
+        or neighbour_fault(state, specs, event.by.name)
+        or start_order_fault(state, specs)
     )
-    fault = fault or start_order_fault(state, specs)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_gangs(state, specs, event.by.name)
@@ -152,7 +153,7 @@ def _taken(state: MasterState, event: happened.SubmissionReceived) -> str:
     if taken:
         return "; ".join(_in_use(state, taken))
     for spec in event.specs:
-        if spec.name in state.processes or spec.name in state.unowned_instances:
+        if spec.name in state.processes:
             left = still_stopping(state, spec.name)
             if left:
                 return left
@@ -182,10 +183,9 @@ def _names(names: list[str]) -> str:
 def still_stopping(state: MasterState, name: str) -> str:
     """Return a sentence on an earlier instance that may still run; "" for none."""
     process = state.processes.get(name)
-    numbers = state.unowned_instances.get(name) if process is None else process.instances
-    if not numbers:
+    if process is None or not process.instances:
         return ""
-    instance = state.instances[min(numbers)]
+    instance = state.instances[min(process.instances)]
     return f"an earlier {instance.id} is still being stopped on {instance.host.name}"
 
 

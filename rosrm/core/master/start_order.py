@@ -65,12 +65,32 @@ def review(state: MasterState, now: float) -> None:
 
 def _review_waiting(state: MasterState, process: Process, now: float) -> None:
     """Let a queued process wait for its dependencies, or be placed."""
-    reason, name = _awaited(state, process, now), process.name
+    name = process.name
+    reason = _awaited_strays(state, process, now) or _awaited(state, process, now)
     if reason and process.reason != reason:
         state.record(now, EventKind.WAITS, f"{name} {reason}", process=name)
     if reason or name in state.queue.awaiting:
         process.reason = reason
     state.queue.set_awaiting(name, awaiting=bool(reason))
+
+
+def _awaited_strays(state: MasterState, process: Process, now: float) -> str:
+    """Return a predicate on instances of its name that hosts report unasked; "": it awaits none.
+
+    The journal may have lost their assignments, so they may run. But a host may also report them
+    falsely, so the wait has an end, which no further report delays.
+    """
+    numbers = state.strays.get(process.name)
+    if not numbers:
+        return ""
+    if not process.strays_until:
+        process.strays_until = now + process.spec.stop.timeout + _PATIENCE
+    if now >= process.strays_until:
+        return ""
+    state.start_orders.set_delay(process.name, process.strays_until)
+    strays = [state.instances[number] for number in sorted(numbers)]
+    have = "has" if len(strays) == 1 else "have"
+    return f"waits until {listed(f'{one.id} on {one.host.name}' for one in strays)} {have} ended"
 
 
 def _awaited(state: MasterState, process: Process, now: float) -> str:

@@ -40,15 +40,15 @@ def no_process_is_lost(state: MasterState) -> None:
 
 def the_books_balance(state: MasterState) -> None:
     """Check that the load of each host is the sum over its instances and not negative."""
-    of_process = defaultdict(set)
+    of_process, strays = defaultdict(set), defaultdict(set)
     for number, instance in state.instances.items():
-        of_process[instance.id.process].add(number)
+        of = strays if instance.stray else of_process
+        of[instance.id.process].add(number)
         assert number in instance.host.instances
     for process in state.processes.values():
         assert process.instances == of_process.pop(process.name, set())
-    assert {
-        name: numbers for name, numbers in state.unowned_instances.items() if numbers
-    } == of_process
+    assert not of_process
+    assert state.strays == strays
     for host in state.hosts.hosts:
         held = [state.instances[number] for number in host.instances]
         assert all(instance.host is host for instance in held)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from rosrm.core.master import events as happened
+from rosrm.model.devices import Device
 from rosrm.model.orders import ReportInstances
-from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, ResourceDescription
+from rosrm.model.sizes import size_of
+from rosrm.model.values import (
+    InstanceId,
+    InstanceState,
+    InstanceStatus,
+    ResourceDescription,
+    SnapshotReport,
+)
 from tests.unit.core.cluster import Cluster, Machine, job, process
 
 #: Sequences that no host reaches: the largest ones of the wire, and one of a signed number.
@@ -232,6 +241,62 @@ def test_processes_are_bounded() -> None:
     assert "`queue.max_processes` (2)" in reply.message
     cluster.finish("q")
     assert cluster.submit(process("r")).accepted
+
+
+HUGE = "x" * 60_000
+
+
+@pytest.mark.parametrize(
+    "texts",
+    [
+        {"labels": {f"k{n}": HUGE for n in range(200)}},
+        {"absent": {f"k{n}": HUGE for n in range(200)}},
+        {"unenforced": {"nice": HUGE * 2}},
+        {"executors": tuple(f"{HUGE}{n}" for n in range(200))},
+        {"launchers": (HUGE * 2,)},
+        {"hostname": HUGE * 2},
+        {"software_version": HUGE * 2},
+        {"resources": (ResourceDescription("r", "B" * 70_000, 1.0),)},
+        {"resources": (ResourceDescription("r", "B", 1.0, HUGE * 2),)},
+        {"cpus": tuple(range(70_000))},
+        {"devices": (Device("gpu", HUGE * 2),)},
+        {"devices": tuple(Device("gpu", f"u{n}", missing=HUGE) for n in range(20))},
+    ],
+    ids=lambda texts: next(iter(texts)),
+)
+def test_the_description_of_a_host_is_bounded(texts: dict[str, Any]) -> None:
+    """A registration has at most 64 KiB of texts; each listing of hosts has a part of them."""
+    cluster = Cluster()
+    description = replace(Machine("a", incarnation=5).description(), **texts)
+    reply = cluster.ask(happened.HostRegistered, description, ())
+    assert (reply.accepted, reply.code) == (False, "invalid")
+    assert len(reply.message) < 1000
+
+
+def test_reports_of_a_host_are_bounded() -> None:
+    """Messages, plugins, devices and snapshots of one host use little of the master's memory."""
+    cluster = Cluster("a").with_processes(process("p"))
+    machine = cluster.machines["a"]
+    machine.batches += 1
+    status = InstanceStatus(
+        InstanceId("p", 1), InstanceState.READY, pid=1, message=HUGE, enforced=(HUGE,) * 16
+    )
+    cluster.tell(
+        happened.StatusesReceived(
+            machine.host_id, machine.incarnation, machine.batches, False, (status,),
+            failing={f"{n}": HUGE for n in range(1000)}, failing_launchers={HUGE: HUGE},
+            devices=tuple(Device("gpu", f"u{n}", missing=HUGE) for n in range(20)),
+        )
+    )  # fmt: skip
+    names = ("s" * 60_000, *(f"s{n}" for n in range(20_000)))
+    snapshots = tuple(SnapshotReport(InstanceId(name, 1), 1, 1) for name in names)
+    cluster.tell(happened.SnapshotsReported(machine.host_id, machine.incarnation, snapshots))
+    host, state = cluster.state.hosts.by_name["a"], cluster.state
+    assert size_of(state.instances[1].message) + size_of(state.instances[1].enforced) < 20_000
+    assert sum(size_of(name) + len(one.error) for (_, name), one in host.failing.items()) < 100_000
+    assert size_of(host.description.devices) < 100_000
+    assert sum(map(len, state.replication.replicas.processes())) < 100_000
+    assert max(len(record.message) for record in cluster.records) < 11_000
 
 
 # --- claims about others ----------------------------------------------------------------------

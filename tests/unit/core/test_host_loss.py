@@ -384,7 +384,9 @@ def test_a_new_process_of_the_name_waits_until_the_old_one_has_ended() -> None:
     cluster.set_host("b", "cordon")
     assert cluster.submit(process("p")).accepted
     cluster.rejoin("a")
-    assert (cluster.phase("p"), cluster.queue()) == ("stopping", [])
+    cluster.set_host("b", "uncordon")
+    cluster.wait(0.5)
+    assert (cluster.phase("p"), cluster.queue()) == ("queued", ["p"])
     assert cluster["p"].reason == "waits until p#1 on a has ended"
     cluster.machines["a"].let_go("p", cluster.now)
     cluster.wait(0.5)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
+from rosrm.model.description_checks import LARGEST_DESCRIPTION
 from rosrm.model.devices import Device
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.sizes import size_of
 
 
 def note_devices(state: MasterState, host: Host, devices: tuple[Device, ...], now: float) -> None:
     """Note the devices of a host, and record those that went missing or are there again."""
     before = {(one.kind, one.unit): one for one in host.description.devices}
-    if devices == host.description.devices:
+    if devices == host.description.devices or size_of(devices) > LARGEST_DESCRIPTION:
         return
     state.hosts.set_devices(host, devices)
     for device in devices:

@@ -94,6 +94,7 @@ class Instance:
         enforced: names of its limits and scheduling settings that hold, as its slave reports.
         ready_at: time at which the first report of its readiness arrived at this master.
         devices: devices of its host that it holds.
+        stray: its host reports it, and the master has not assigned it to that host.
     """
 
     id: InstanceId
@@ -120,6 +121,7 @@ class Instance:
     enforced: tuple[str, ...] = ()
     ready_at: float = inf
     devices: tuple[HeldDevice, ...] = ()
+    stray: bool = False
 
     @property
     def is_running(self) -> bool:
@@ -253,6 +255,8 @@ class Process:
         reschedules: number of times that it was queued again after it had failed, in a row.
         queue_delay: seconds in the queue before its next placement.
         next_run: unix time of the next run of its schedule; 0: none.
+        strays_until: time until which it waits in the queue for the ends of its strays; 0: it did
+            not wait for them.
         restart_due: True: a dependency was restarted, and the process must be restarted in place as
             soon as the conditions of its start order hold.
         defaulted: paths of the fields of its spec whose values are the cluster's defaults.
@@ -298,6 +302,7 @@ class Process:
     reschedules: int = 0
     queue_delay: float = 0.0
     next_run: float = 0.0
+    strays_until: float = 0.0
     restart_due: bool = False
     history: list[tuple[float, EventKind, str]] = field(default_factory=list)
     defaulted: tuple[str, ...] = ()

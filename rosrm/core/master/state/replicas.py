@@ -7,14 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import islice
 from math import inf
 from typing import Final
 
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointPolicy
+from rosrm.model.description_checks import name_fault
 from rosrm.model.values import EMPTY, SnapshotReport
 
+#: Most snapshots of one host that count.
+_MOST_OF_HOST: Final = 10_000
 _IN_REACH: Final = frozenset({HostCondition.UP, HostCondition.SUSPECT})
 
 
@@ -49,7 +53,11 @@ class ReplicaIndex:
 
     def replace(self, host: str, states: Iterable[SnapshotReport], now: float) -> None:
         """Replace the snapshots of a host by its report."""
-        reported = {state.instance.process: state for state in states}
+        reported = {
+            state.instance.process: state
+            for state in islice(states, _MOST_OF_HOST)
+            if not name_fault(state.instance.process, "process")
+        }
         for process in self._on.get(host, set()) - reported.keys():
             self._remove(process, host)
         for process, state in reported.items():
