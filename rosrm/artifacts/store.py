@@ -13,6 +13,7 @@ from typing import Any, Final
 
 from rosrm.errors import Refused
 from rosrm.model.artifacts import LARGEST_ARTIFACT, is_digest
+from rosrm.model.ledger import Store, bound_of
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.wording import size as sized
@@ -85,7 +86,8 @@ class ArtifactStore:
         """Store a part of an archive, and return the offset of the next one.
 
         Args:
-            sender: each sender has its own uploads, so that none can spoil those of others.
+            sender: principal and run, separated by a space. Each has its own uploads, so that none
+                can spoil those of others, and all of one principal are bounded.
             size: of the whole archive, which has arrived when the result is `size`.
             data: b"": only return the offset, and make room for the archive if it is unknown; a
                 part of an unknown archive is not stored.
@@ -141,6 +143,10 @@ class ArtifactStore:
         self, sender: str, digest: str, size: int, now: float, keep: AbstractSet[str]
     ) -> _Upload:
         self._end((sender, digest))
+        principal = sender.partition(" ")[0]
+        own = sum(one.partition(" ")[0] == principal for one, _ in self._uploads)
+        if own >= bound_of(Store.UPLOADS, is_operator=False).number:
+            raise Refused(f"{principal} is sending {own} other artifacts", "busy")
         if len(self._uploads) >= _MOST_UPLOADS:
             raise Refused(f"{_MOST_UPLOADS} other artifacts are being sent", "busy")
         self._make_room(size, now, keep)

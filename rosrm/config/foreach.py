@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import Final
 
@@ -25,7 +25,7 @@ from rosrm.config.documents import Node, Problems
 from rosrm.model.arrays import INDEX
 from rosrm.model.placeholders import PLACEHOLDER
 
-#: Highest number of processes to which one entry may expand.
+#: Highest number of processes to which the entries of a file may expand.
 MOST: Final = 10_000
 
 Scalar = bool | int | float | str
@@ -37,6 +37,18 @@ _RANGE: Final = re.compile(
 _PIECE: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
 _TOO_WIDE: Final = re.compile(r"\d{4}")
 _WHOLE: Final = re.compile(rf"\{{([A-Za-z_]\w*|{re.escape(INDEX)})\}}")
+
+
+def all_expanded(entries: Iterable[Node], problems: Problems) -> Iterator[Node]:
+    """Yield all entries of a file expanded; note a problem if they make too many processes."""
+    made = 0
+    for entry in entries:
+        for node in expanded(entry, problems):
+            made += 1
+            if made > MOST:
+                problems.add(entry.place, f"the file makes more than {MOST} processes")
+                return
+            yield node
 
 
 def expanded(entry: Node, problems: Problems) -> Iterator[Node]:

@@ -12,7 +12,7 @@ from typing import Any, Final
 from rosrm.artifacts.pack import source_fault
 from rosrm.config.checking import described, near, salvaged, validated
 from rosrm.config.documents import Node, Place, Problems, node_of, read
-from rosrm.config.foreach import expanded
+from rosrm.config.foreach import all_expanded
 from rosrm.config.groups import grouped
 from rosrm.config.kinds import check_kind
 from rosrm.config.merging import merged, written_out
@@ -99,11 +99,8 @@ def checked_work(
     entries = _entries(root, problems)
     defaults = _defaults(root, problems)
     plugins = PluginCheck(registry, problems)
-    nodes = [
-        node
-        for entry in entries
-        for node in expanded(_with_group(merged(defaults, written_out(entry))), problems)
-    ]
+    complete = (_with_group(merged(defaults, written_out(entry))) for entry in entries)
+    nodes = list(all_expanded(complete, problems))
     specs = [_process(node, path, plugins, problems) for node in nodes]
     _refuse_contradictions(nodes, specs, problems)
     refuse_namesakes(nodes, "process", problems)

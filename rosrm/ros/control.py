@@ -18,8 +18,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rosrm.errors import Refused
 from rosrm.keys.links import Link
+from rosrm.keys.roles import Role
 from rosrm.keys.security import Peer
-from rosrm.ros.bounds import MOST_LETTERS
+from rosrm.model.ledger import Amount, Ledger, Store, bound_of
+from rosrm.ros.bounds import MOST_LETTERS, check_bounds
 from rosrm.ros.sealed import SealedEndpoints, SealedRequest, failed_response
 from rosrm.version import PROTOCOL_VERSION
 from rosrm.wording import sendable
@@ -97,17 +99,21 @@ class RequestGate:
         beat: the receiver's monotonic clock, ns.
         max_age: seconds after which a request is stale.
         remembered: ids that are remembered at least.
+        bound: of the remembered answers together. Beyond it, only the ids of the oldest stay.
     """
 
     def __init__(
-        self, beat: Callable[[], int], max_age: float, remembered: int = _REMEMBERED
-    ) -> None:
+        self, beat: Callable[[], int], max_age: float, remembered: int = _REMEMBERED,
+        bound: Amount = bound_of(Store.ANSWERS, is_operator=True),  # noqa: B008 - immutable
+    ) -> None:  # fmt: skip
         self._beat = beat
         self._max_age = max_age
         self._remembered = remembered
         self._answers: OrderedDict[str, Any] = OrderedDict()
         self._admitted: dict[str, int] = {}
         self._waiting: dict[str, deque[SealedRequest]] = {}
+        self._bound = bound
+        self._sizes = Ledger[str]()
 
     def refusal(self, envelope: Envelope, epoch: int | None = None) -> Answer | None:
         """Return the refusal of a request, or None.
@@ -150,6 +156,7 @@ class RequestGate:
             if (self._beat() - self._admitted[oldest]) * _NS <= self._max_age:
                 return len(self._answers) < _MOST_REMEMBERED
             del self._answers[oldest], self._admitted[oldest]
+            self._sizes.remove("", oldest)
             self._waiting.pop(oldest, None)
         return True
 
@@ -175,11 +182,19 @@ class RequestGate:
         """Store an answer, and send it to the repetitions of its request that already wait."""
         if envelope.request_id in self._answers:
             self._answers[envelope.request_id] = response
+            self._sizes.put("", envelope.request_id, check_bounds(response))
+            for oldest in self._sizes.beyond("", self._bound):
+                self._sizes.remove("", oldest)
+                self._answers[oldest] = type(self._answers[oldest])(answer=_NOT_KEPT)
         for request in self._waiting.pop(envelope.request_id, ()):
             request.answer(response)
 
 
 _PENDING: Final = object()
+#: Answer to the repetition of a request whose answer was too large to be kept.
+_NOT_KEPT: Final = refused(
+    "stale", "the request was carried out before, and its answer is not kept: look at the outcome"
+)
 
 
 #: Called with a request, its sealed form (with the sender), and the function that answers it.
@@ -211,7 +226,9 @@ class ControlServer:
         """
         gate = self._gates.get((sender.link, remembered))
         if gate is None:
-            gate = RequestGate(time.monotonic_ns, self._max_age, remembered)
+            is_operator = sender.grant.role is not Role.SUBMITTER
+            bound = bound_of(Store.ANSWERS, is_operator=is_operator)
+            gate = RequestGate(time.monotonic_ns, self._max_age, remembered, bound)
             self._gates[sender.link, remembered] = gate
         return gate
 

@@ -4,8 +4,8 @@ reducer.py     the transition table: the handler of each event
 events.py, commands.py, outcomes.py, settings.py
 master_state.py, state/   data and the rules that keep it consistent
 tick.py        periodic work
-requests.py    requests of clients; rights.py, quotas.py, contradictions.py, process_defaults.py,
-               pruning.py, graph_names.py, cancellation.py
+requests.py    requests of clients; rights.py, quotas.py, stores.py, contradictions.py,
+               process_defaults.py, pruning.py, graph_names.py, cancellation.py
 answers.py     answers of slaves to orders; reloading.py
 garbage.py     removal of what has ended from memory and journal
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py

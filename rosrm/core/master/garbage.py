@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core.master.dependants import binding_dependants
-from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.master_state import MasterState, process_key, version_key
 from rosrm.core.master.state.applications import Application
 from rosrm.core.master.state.intents import version_intent
 from rosrm.core.master.state.process import Process, ProcessPhase
@@ -47,6 +47,7 @@ def remove_application(state: MasterState, application: Application) -> None:
     del state.applications[application.name]
     state.unsaved.applications.pop(application.name, None)
     for number in application.versions:
+        state.ledger.remove(application.principal, version_key(application.name, number))
         state.emit(version_intent(application.name, number, None))
     state.emit(Intent("application", application.name, None))
 
@@ -55,7 +56,9 @@ def remove_process(state: MasterState, name: str) -> None:
     """Remove a terminal process; none of its instances may run."""
     del state.terminal[name]
     state.replication.last_orders.pop(name, None)
-    if state.declared.has_snapshots(state.processes.pop(name).spec):
+    process = state.processes.pop(name)
+    state.ledger.remove(process.principal, process_key(name))
+    if state.declared.has_snapshots(process.spec):
         _note_removed(state, name)
     state.unsaved.processes.pop(name, None)
     state.emit(Intent("process", name, None))

@@ -51,10 +51,12 @@ from rosrm.extensions.placement import ChainOf, PlacementPlugins, PolicySettings
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import Plain
+from rosrm.model.ledger import Ledger
 from rosrm.model.modes import Mode
 from rosrm.model.orders import Order
 from rosrm.model.records import Intent, Record
 from rosrm.model.requester import OPERATOR, Requester
+from rosrm.model.sizes import size_of
 from rosrm.model.values import EMPTY, LARGEST_NUMBER, Assignment, InstanceId, ProcessSpec
 from rosrm.wording import sanitized
 
@@ -68,8 +70,21 @@ _BEFORE_REPORT: Final = frozenset({ProcessPhase.ASSIGNED, ProcessPhase.STARTING}
 _ENDS_OF_RUNS: Final = frozenset({ProcessPhase.FINISHED, ProcessPhase.FAILED})
 #: Most letters of the message of a record.
 _LONGEST_RECORD: Final = 10_000
+#: Key of a spec in the ledger: that of a process, or of a version of an application.
+SpecKey = tuple[str, str, int]
+PROCESS: Final = "process"
 #: Seconds between two records of the same kind about the same host.
 RECORD_PERIOD: Final = 10.0
+
+
+def process_key(name: str) -> SpecKey:
+    """Return the key of a process in the ledger of specs."""
+    return PROCESS, name, 0
+
+
+def version_key(application: str, number: int) -> SpecKey:
+    """Return the key of a version of an application in the ledger of specs."""
+    return "version", application, number
 
 
 class MasterState:
@@ -77,6 +92,7 @@ class MasterState:
 
     Attributes:
         placement: the policies and filters that judge hosts.
+        ledger: specs of processes and versions by their owner, with their sizes.
         declared: declarations in the offers of the selected plugins.
         time_limited: names of the processes with a time limit that are not terminal.
         scheduled: names of the processes with a schedule that are not terminal.
@@ -123,6 +139,7 @@ class MasterState:
         self.hosts = HostTable()
         self.queue = Queue()
         self.processes: dict[str, Process] = {}
+        self.ledger = Ledger[SpecKey]()
         self.applications: dict[str, Application] = {}
         self.modes = Modes()
         self.terminal: dict[str, None] = {}
@@ -234,10 +251,17 @@ class MasterState:
 
     def save_version(self, application: Application, version: Version) -> None:
         """Persist a version of an application, and drop the oldest ones."""
-        application.versions[version.number] = version
+        self.note_version(application, version)
         self.emit(version_intent(application.name, version.number, version))
         for dropped in application.keep(self.settings.keep_versions):
+            self.ledger.remove(application.principal, version_key(application.name, dropped))
             self.emit(version_intent(application.name, dropped, None))
+
+    def note_version(self, application: Application, version: Version) -> None:
+        """Add a version to an application, and its size to what the owner stores."""
+        application.versions[version.number] = version
+        key = version_key(application.name, version.number)
+        self.ledger.put(application.principal, key, size_of(version.specs))
 
     def save_modes(self) -> None:
         """Persist which mode is in force, and the progress of a switch."""
@@ -305,8 +329,11 @@ class MasterState:
 
     def add_process(self, process: Process) -> None:
         """Add a process; it replaces a terminal one of the same name."""
-        self.processes.pop(process.name, None)  # listings are in order of submission
+        former = self.processes.pop(process.name, None)  # listings are in order of submission
+        if former is not None:
+            self.ledger.remove(former.principal, process_key(process.name))
         self.processes[process.name] = process
+        self.ledger.put(process.principal, process_key(process.name), size_of(process.spec))
         self._update_terminal(process)
         self.start_orders.note_change(process.name)
 
@@ -356,6 +383,7 @@ class MasterState:
             self.gangs.leave(process)
         self._forget_node(process)
         process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
+        self.ledger.put(process.principal, process_key(process.name), size_of(spec))
         process.demand, process.awaits_gang = None, awaits_gang
         self.wants_standby.pop(process.name, None)
         self.time_limited.pop(process.name, None)

@@ -32,6 +32,7 @@ from rosrm.core.master.scheduling.feasibility import unknown_resources
 from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
+from rosrm.core.master.stores import check_store, make_room
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import container_conflict, no_standby
@@ -74,10 +75,12 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         raise RequestRefused(f"{fault}. Nothing was queued")
     check_gangs(state, specs, event.by.name)
     check_quota(state, specs, event.by)
+    check_store(state, specs, event.by.name, is_operator=event.by.is_operator)
     adopted = {spec.name: spec.adoption for spec in specs if spec.adoption.host}
     for adoption in adopted.values():
         check_adoption(state, adoption, now)
     processes = [add_process(state, spec, defaulted, event.by, now) for spec, defaulted in filled]
+    make_room(state, event.by.name, is_operator=event.by.is_operator)
     for process in processes:
         if process.name in adopted:
             assign_to_adopt(state, process, now)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
 
+from rosrm.model.ledger import Ledger, Store, bound_of
+from rosrm.model.requester import Requester
+from rosrm.model.sizes import size_of
 from rosrm.model.values import ProcessSpec
 from rosrm.ros.spec_digests import LENGTH
-
-#: Most specs that are kept: two of the largest requests.
-_MOST: Final = 20_000
 
 
 class KnownSpecs:
@@ -20,6 +19,7 @@ class KnownSpecs:
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, str], ProcessSpec] = {}
+        self._ledger = Ledger[str]()
 
     def lacking(self, user: str, digests: Sequence[str]) -> list[int]:
         """Return the positions of the digests of which no spec is kept."""
@@ -39,11 +39,13 @@ class KnownSpecs:
         found = (self._kept.get((user, digest)) for digest in digests)
         return tuple(next(rest) if one is None else one for one in found)
 
-    def keep(self, user: str, digests: Sequence[str], specs: Sequence[ProcessSpec]) -> None:
+    def keep(self, user: Requester, digests: Sequence[str], specs: Sequence[ProcessSpec]) -> None:
         """Keep the specs of a target for the next requests of a user; drop the oldest ones."""
         for digest, spec in zip(digests, specs, strict=False):
-            self._kept.pop((user, digest), None)
             if len(digest) == LENGTH:
-                self._kept[user, digest] = spec
-        while len(self._kept) > _MOST:
-            del self._kept[next(iter(self._kept))]
+                self._kept[user.name, digest] = spec
+                self._ledger.put(user.name, digest, size_of(spec))
+        bound = bound_of(Store.KNOWN_SPECS, is_operator=user.is_operator)
+        for digest in self._ledger.beyond(user.name, bound):
+            self._ledger.remove(user.name, digest)
+            del self._kept[user.name, digest]

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final, Protocol
 
 from rosrm.config.settings import ControlSettings
@@ -31,9 +32,10 @@ from rosrm.ros.control import (
 )
 from rosrm.ros.introductions import ticket_version
 from rosrm.ros.master.known_specs import KnownSpecs
+from rosrm.ros.master.reads import FairReads
 from rosrm.ros.master.refusals import Refuse
 from rosrm.ros.master.slave_links import HostLink, HostLinks
-from rosrm.ros.sealed import SealedEndpoints, SealedRequest
+from rosrm.ros.sealed import SealedEndpoints, SealedRequest, failed_response
 from rosrm.ros.spec_digests import UNKNOWN_DIGEST, digest_of, positions_to_text
 from rosrm.runtime.local_zone import local_zone
 from rosrm.version import PROTOCOL_VERSION, __version__
@@ -116,6 +118,7 @@ class MasterServices:
         self._refuse = refuse
         self._strangers = strangers
         self._known = KnownSpecs()
+        self._reads = FairReads(endpoints.participant.post)
         self._open: dict[int, Callable[[Reply], None]] = {}
         self._next_request = 1
         self._held: list[tuple[srv.Handshake.Request, SealedRequest]] | None = None
@@ -123,8 +126,8 @@ class MasterServices:
 
     def _offer(self, path: names.Names) -> None:
         serve, offer = self._endpoints.serve, self._server.offer
-        serve(srv.List, path(names.LIST), self._take_list)
-        serve(srv.Explain, path(names.EXPLAIN), self._take_explain)
+        serve(srv.List, path(names.LIST), self._in_turn(srv.List, self._take_list))
+        serve(srv.Explain, path(names.EXPLAIN), self._in_turn(srv.Explain, self._take_explain))
         serve(srv.Introduce, path(names.INTRODUCE), self._take_introduction)
         offer(srv.RequestProcess, path(names.REQUEST_PROCESS), self._take_poll, remember=False)
         offer(srv.RegisterHost, path(names.REGISTER_HOST), self._take_registration)
@@ -207,7 +210,7 @@ class MasterServices:
             for one, known in zip(request.targets, digests, strict=True)
         ]
         for known, found in zip(digests, specs, strict=True):
-            self._known.keep(by.name, known, found)
+            self._known.keep(by, known, found)
         targets = tuple(map(convert.target_from_msg, request.targets, specs))
         return happened.ApplicationsRequested(token, targets, bool(request.plan_only), by)
 
@@ -413,6 +416,23 @@ class MasterServices:
         return first
 
     # --- read-only requests --------------------------------------------------------------
+
+    def _in_turn(
+        self, kind: Any, take: Callable[[Any, SealedRequest], None]
+    ) -> Callable[[Any, SealedRequest], None]:
+        """Return a handler that answers a request when it is the turn of its sender."""
+        guard = self._endpoints.participant.guard
+
+        def answer(request: Any, open_request: SealedRequest) -> None:
+            fault = guard.call(take, request, open_request)
+            if fault and not open_request.answered:
+                open_request.answer(failed_response(kind, fault))
+
+        def queue(request: Any, open_request: SealedRequest) -> None:
+            sender = _requester(open_request.peer)
+            self._reads.add(sender, partial(answer, request, open_request))
+
+        return queue
 
     def _take_list(self, request: srv.List.Request, open_request: SealedRequest) -> None:
         fault = version_refusal(request.protocol_version, "a listing")

@@ -8,6 +8,7 @@ import pytest
 
 from rosrm.artifacts.store import ArtifactStore
 from rosrm.errors import Refused
+from rosrm.model.ledger import Store, bound_of
 
 NONE: frozenset[str] = frozenset()
 
@@ -99,6 +100,17 @@ def test_no_sender_spoils_the_upload_of_another(store):
     with pytest.raises(Refused):
         store.take("eve", digest, 4000, 0, bytes(4000), keep=NONE)
     assert store.take("ada", digest, 4000, 2000, data[2000:], keep=NONE) == 4000
+
+
+def test_no_user_takes_the_uploads_of_others(store):
+    """Runs of one principal share a bound; another principal may still begin."""
+    most = bound_of(Store.UPLOADS, is_operator=False).number
+    for number in range(most):
+        store.take(f"user:eve {number}", data_of(number)[0], 10, 0, b"", keep=NONE)
+    with pytest.raises(Refused, match="user:eve is sending") as refusal:
+        store.take("user:eve more", data_of(99)[0], 10, 0, b"", keep=NONE)
+    assert refusal.value.code == "busy"
+    assert store.take("user:ada 1", data_of(99)[0], 10, 0, b"", keep=NONE) == 0
 
 
 def test_the_oldest_unreferenced_contents_give_way(store, clock):

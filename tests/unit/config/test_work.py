@@ -379,6 +379,18 @@ def test_a_spec_names_the_given_keys_and_those_of_the_defaults(file):
     ]  # fmt: skip
 
 
+def test_all_entries_of_a_file_together_make_a_bounded_number(tmp_path):
+    """Each entry alone is within the bound."""
+    entries = "".join(
+        f"  - {{name: 'p{n}_{{i}}', foreach: {{i: 'range(0, 4000)'}}, command: x}}\n"
+        for n in range(3)
+    )
+    file = tmp_path / "work.yaml"
+    file.write_text(f"processes:\n{entries}")
+    with pytest.raises(ConfigError, match="the file makes more than 10000 processes"):
+        load_work(file)
+
+
 def test_foreach_makes_many_alike(file):
     specs = load_work(
         file(

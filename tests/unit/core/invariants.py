@@ -7,10 +7,11 @@ from collections import defaultdict
 import numpy as np
 
 from rosrm.core.master.assignment.neighbours import locate
-from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.master_state import MasterState, process_key, version_key
 from rosrm.core.master.state.host_arrays import TIE
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import BEFORE_START, DesiredState, ProcessPhase
+from rosrm.model.sizes import size_of
 
 
 def no_process_is_lost(state: MasterState) -> None:
@@ -49,6 +50,13 @@ def the_books_balance(state: MasterState) -> None:
         assert process.instances == of_process.pop(process.name, set())
     assert not of_process
     assert state.strays == strays
+    stored = defaultdict(dict)
+    for process in state.processes.values():
+        stored[process.principal][process_key(process.name)] = size_of(process.spec)
+    for one in state.applications.values():
+        for number, version in one.versions.items():
+            stored[one.principal][version_key(one.name, number)] = size_of(version.specs)
+    assert state.ledger.items() == stored
     for host in state.hosts.hosts:
         held = [state.instances[number] for number in host.instances]
         assert all(instance.host is host for instance in held)

@@ -799,7 +799,7 @@ def test_a_process_starts_after_the_end_of_an_instance_that_no_process_owns() ->
     cluster.apply("nav", process("p"))
     cluster.wait(3.0)
     assert cluster.where("p") == ["a"]
-    assert row(cluster).pending == {"p": "an earlier p#1 is still being stopped on a"}
+    assert row(cluster).pending == {"p": "waits until p#1 on a has ended"}
     cluster.let_go("p")
     cluster.wait(3.0)
     assert (cluster.where("p"), row(cluster).state) == (["a"], "running")

@@ -9,6 +9,7 @@ import pytest
 
 from rosrm.keys.cluster import ClusterSecret
 from rosrm.keys.security import MasterSecurity
+from rosrm.model.ledger import Amount
 from rosrm.ros import control
 from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.control import (
@@ -242,3 +243,19 @@ def test_long_polls_take_little_memory_of_a_gate(monkeypatch) -> None:
         clock.now += 30.0
     (gate,) = served.server._gates.values()
     assert len(gate._answers) <= 16
+
+
+def test_remembered_answers_of_a_sender_are_bounded_in_bytes() -> None:
+    """The newest are repeated; of the oldest only the ids stay."""
+    one = RequestGate(lambda: 100 * S, 5.0, bound=Amount(1000, 100_000))
+    for number in range(50):
+        sent = envelope(100 * S, request_id=f"r{number}")
+        assert not one.repeated(sent, Requested())
+        one.remember(sent, srv.Apply.Response(answer=accepted(), actions="x" * 20_000))
+    kept = sum(len(answer.actions) for answer in one._answers.values())
+    assert kept <= 100_000
+    for number, (size, code) in {49: (20_000, ""), 0: (0, "stale")}.items():
+        again = Requested()
+        assert one.repeated(envelope(100 * S, request_id=f"r{number}"), again)
+        (answer,) = again.answers
+        assert (len(answer.actions), answer.answer.code) == (size, code)

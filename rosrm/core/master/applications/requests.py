@@ -24,6 +24,7 @@ from rosrm.core.master.rights import check_rights
 from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.process import DesiredState, Process
+from rosrm.core.master.stores import check_store, make_room
 from rosrm.model.applications import Action, PlannedAction, Target
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.requester import Requester
@@ -72,6 +73,9 @@ def execute(
     """
     prepared = _prepared(state, targets, by)
     _want_all(state, prepared, by, now)
+    for one in prepared:
+        owner = one.application
+        make_room(state, owner.principal, is_operator=owner.by_operator)
     return _summary(prepared), tuple(_actions(prepared))
 
 
@@ -95,6 +99,12 @@ def _want_all(state: MasterState, prepared: Sequence[Prepared], by: Requester, n
 
 def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> list[Prepared]:
     """Return the checked targets; refuse the request as a whole."""
+    given, most = sum(len(one.specs) for one in targets), state.settings.max_processes
+    if given > most:  # before any of them is looked at
+        raise RequestRefused(
+            f"{given} processes are requested at once, and the cluster may have {most} "
+            f"(`queue.max_processes`). Nothing was changed"
+        )
     _refuse_twice(
         (one.application for one in targets), "application", "put all its processes into one file"
     )
@@ -239,6 +249,10 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
         own = [spec for spec in started if spec.application == one.application.name]
         check_gangs(state, own, owner)
         check_quota(state, own, by if owner == by.name else Requester(owner))
+        new = one.version is not None and one.number not in one.application.versions
+        version = one.version.specs.values() if one.version is not None and new else ()
+        operator = one.application.by_operator
+        check_store(state, own, owner, is_operator=operator, version=version)
 
 
 def _start_order_fault(state: MasterState, prepared: Iterable[Prepared]) -> str:

@@ -82,7 +82,7 @@ def _restore_applications(state: MasterState, intents: Callable[[str], _Table]) 
         _, _, name = key.partition(" ")
         if name in state.applications:
             version = applications.version_from_dict(item)
-            state.applications[name].versions[version.number] = version
+            state.note_version(state.applications[name], version)
     for one in state.applications.values():
         one.versions = dict(sorted(one.versions.items()))
 

@@ -31,6 +31,9 @@ class ServingWire(Wire):
     def serve(self, kind, _name, handle, **_named) -> None:
         self.handlers[kind] = handle
 
+    def post(self, callback) -> None:
+        callback()
+
 
 class FakeRequest:
     """A genuine request, with its answers."""
