@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import takewhile
 from traceback import walk_stack, walk_tb
 from types import FrameType
 from typing import Final
 
+from rosrm.wording import sanitized
+
+#: Most letters of the text of an exception, and of a text that a plugin returns. Receivers of
+#: messages accept many more, so that no sentence around such a text exceeds their bounds.
+LONGEST_TEXT: Final = 1_500
+#: Most letters of the place of an exception.
+_LONGEST_PLACE: Final = 500
 #: Packages that load and call plugins; their frames are never frames of a plugin.
-_LOADERS: Final = frozenset({"rosrm", "pkgutil", "importlib", "pluggy", "typer", "click"})
+_LOADERS: Final = frozenset({
+    "rosrm", "pkgutil", "importlib", "pluggy", "typer", "click", "contextlib", "dataclasses",
+})  # fmt: skip
 
 
 class RosrmError(Exception):
@@ -105,12 +114,32 @@ class SkipPlugin(Exception):
 
 
 def describe_fault(fault: BaseException) -> str:
-    """Return an exception in one line: its type and its text."""
+    """Return an exception in one printable line of bounded length: its type and its text.
+
+    The exception may be a plugin's own, so both may raise, or be anything.
+    """
+    kind, text = _text_of(lambda: type(fault).__name__), _text_of(lambda: str(fault))
+    return f"{kind}: {text}" if text else kind
+
+
+def _text_of(read: Callable[[], object]) -> str:
     try:
-        text = " ".join(str(fault).split())
-    except Exception:  # noqa: BLE001 - a plugin's own exception may fail to give its text
-        text = ""
-    return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
+        return plain_text(read())
+    except BaseException:  # noqa: BLE001 - see `describe_fault`
+        return ""
+
+
+def plain_text(text: object, *, lines: bool = False) -> str:
+    """Return a text of a plugin as a printable `str` of bounded length; "": it is no text.
+
+    Args:
+        text: may be of a subclass of `str`, whose methods are the plugin's.
+        lines: True: newlines stay.
+    """
+    if not isinstance(text, str):
+        return ""
+    exact = str.__str__(text)[: LONGEST_TEXT * 2]
+    return sanitized(exact if lines else " ".join(exact.split()), LONGEST_TEXT, lines=lines)
 
 
 def describe_plugin_fault(fault: BaseException) -> str:
@@ -118,9 +147,9 @@ def describe_plugin_fault(fault: BaseException) -> str:
 
     The text of a `PluginError` is rosrm's own sentence, and is returned unchanged.
     """
-    if isinstance(fault, PluginError):
+    if type(fault) is PluginError:
         return str(fault)
-    place = place_in_plugin(fault)
+    place = sanitized(_text_of(lambda: place_in_plugin(fault)), _LONGEST_PLACE)
     return describe_fault(fault) + (f" ({place})" if place else "")
 
 

@@ -19,7 +19,9 @@ import typer
 
 from rosrm.cli.groups import CommandLineError, PlainCommand, add_command
 from rosrm.errors import PluginError, RosrmError, describe_plugin_fault
+from rosrm.extensions.guard import guarded
 from rosrm.extensions.installed import COMMANDS, PluginAddress, installed_plugins
+from rosrm.extensions.process_state import Interrupts
 from rosrm.model.rows import PluginRow
 from rosrm.wording import listed
 
@@ -47,12 +49,16 @@ def load_command(name: str, addresses: Sequence[PluginAddress]) -> Any:
         return _unusable(name, f"the command {name!r} is in {brought_by}; uninstall all but one")
     (address,) = addresses
     alone = typer.Typer(add_completion=False, rich_markup_mode=None)
-    try:
+
+    def load() -> Any:
         with redirect_stdout(sys.stderr):  # `rosrm COMMAND --json` prints nothing else
             add_command(alone, name, resolve_name(address.target))
         return _guarded(typer.main.get_group(alone).commands[name], address)
-    except (Exception, SystemExit) as fault:  # noqa: BLE001 - code of another distribution
-        reason = describe_plugin_fault(fault)
+
+    try:
+        return guarded(load, whom=f"the command {name!r}", hook="import")
+    except PluginError as fault:
+        reason = str(fault)
     return _unusable(
         name, f"the command {name!r} of {address.distribution} cannot be loaded: {reason}"
     )
@@ -74,12 +80,15 @@ def _guarded(command: Any, address: PluginAddress) -> Any:
     invoke = command.invoke
 
     def guarded(ctx: Any) -> Any:
+        interrupts = Interrupts()
         try:
             return invoke(ctx)
-        except (RosrmError, typer.Exit, typer.Abort, CommandLineError):
+        except (RosrmError, typer.Exit, typer.Abort, CommandLineError, SystemExit):
             raise
-        except Exception as fault:
+        except BaseException as fault:
             if isinstance(fault, OSError) and fault.errno in _OF_OUTPUT:
+                raise
+            if isinstance(fault, KeyboardInterrupt) and interrupts.pressed:
                 raise
             if os.environ.get("ROSRM_TRACEBACK"):
                 traceback.print_exc()
@@ -87,6 +96,8 @@ def _guarded(command: Any, address: PluginAddress) -> Any:
                 f"the command {address.name!r} of {address.distribution} failed: "
                 f"{describe_plugin_fault(fault)}; ROSRM_TRACEBACK=1 shows the whole traceback"
             ) from fault
+        finally:
+            interrupts.end()
 
     command.invoke = guarded
     return command

@@ -7,8 +7,9 @@ from typing import Any, Final, Literal, get_args, get_type_hints
 
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
-from rosrm.errors import ConfigError
+from rosrm.errors import ConfigError, PluginError
 from rosrm.extensions.declared_fields import container_conflict, no_standby
+from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import IsResource
@@ -89,11 +90,14 @@ class PluginCheck:
         return self._options(f"options of {TITLES[kind]} {name!r}", wanted or offer.options, given)
 
     def _options(self, title: str, wanted: type[Any], given: Node) -> Mapping[str, Any]:
-        try:
+        def checked() -> Mapping[str, Any]:
             value = validated(wanted, given, self._problems, title)
             self._check_names(wanted, given, title)
             return {} if value is None else dict(to_plain(value))
-        except Exception as fault:  # noqa: BLE001 - the annotations are a plugin's, not ours
+
+        try:  # the annotations and the checks are a plugin's, not ours
+            return guarded(checked, whom=title, hook="options")
+        except PluginError as fault:
             self._problems.add(given.place, f"{title} cannot be checked: {fault}")
             return {}
 

@@ -12,7 +12,7 @@ from rosrm.extensions.registry import Registry
 def placement_of(config: ClusterConfig, registry: Registry) -> PlacementPlugins:
     """Return the selected policies and filters, without a fallback; raises as `chain_of` does."""
     chain = chain_of(registry, settings_of_chain(config))
-    return PlacementPlugins(chain, filters=registry.filters(config.filters))
+    return PlacementPlugins(chain, filters=registry.filters(config.filters), calls=registry.calls)
 
 
 def settings_of_chain(config: ClusterConfig) -> tuple[PolicySettings, ...]:

@@ -21,8 +21,9 @@ from typing import Any, Final, Literal, TypeAlias, TypeVar, get_args, get_type_h
 
 import pluggy
 
-from rosrm.errors import describe_plugin_fault
-from rosrm.extensions import hookspecs
+from rosrm.errors import PluginError, plain_text
+from rosrm.extensions import guard, hookspecs
+from rosrm.extensions.answers import fault_of
 from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointOffer,
@@ -35,7 +36,6 @@ from rosrm.extensions.contracts import (
 from rosrm.extensions.declared_fields import SPEC_FIELDS
 from rosrm.extensions.installed import GROUP, PluginAddress
 from rosrm.extensions.sinks import SinkOffer
-from rosrm.extensions.time_limit import limited
 from rosrm.model.rows import PluginKind
 from rosrm.wording import get_close_matches
 
@@ -59,16 +59,20 @@ HOOKS: Final[Mapping[str, tuple[PluginKind, type[Any]]]] = {
 
 #: Seconds after which a warning names a plugin that is still being loaded.
 SLOW_LOADING: Final = 5.0
-#: Time-out of the import of a plugin, and of each of its hooks; seconds.
-LOADING_LIMIT: Final = 30.0
 
 #: Names of offers, which are written in files and shown in tables.
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _NAME_FORM: Final = (
     'at most 64 letters, digits, "_", "-" and ".", the first of them a letter or digit'
 )
-#: Exceptions of a faulty plugin; a plugin that calls `sys.exit` must not end the master.
-FAULTS: Final = (Exception, SystemExit)
+#: Most offers of one hook.
+_MOST_OFFERS: Final = 256
+#: Least and highest value of a field of an offer, by its name.
+_RANGES: Final[Mapping[str, tuple[float, float]]] = {
+    "period": (0.001, 86_400.0), "deadline": (0.001, 86_400.0), "batch": (1, 10_000),
+}  # fmt: skip
+#: Names of environment variables.
+_VARIABLE: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,127}")
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -149,23 +153,26 @@ def _in_time(source: PluginSource, what: Callable[[], str], call: Callable[[], T
     `what` returns a description of the code; only warnings call it, because it may read a file.
 
     Raises:
-        TimeoutError: the code took longer than `LOADING_LIMIT`.
+        PluginError: as `guarded`.
     """
+    limit = guard.LOADING_LIMIT
 
     def say() -> None:
         _log.warning(
             "%s is still being loaded after %g s: %s has not returned; it is ended after %g s",
-            source, SLOW_LOADING, what(), LOADING_LIMIT,
+            source, SLOW_LOADING, what(), limit,
         )  # fmt: skip
 
     timer = threading.Timer(SLOW_LOADING, say)
     timer.daemon = True
     timer.start()
-    late = f"it did not return within {LOADING_LIMIT:g} s; move slow work into `create`"
+    late = f"it did not return within {limit:g} s; move slow work into a thread of its own"
     try:
         # What the code prints must not mix with the output of a command, such as JSON.
         with contextlib.redirect_stdout(sys.stderr):
-            return limited(LOADING_LIMIT, call, lambda: late)
+            return guard.guarded(
+                call, whom=str(source), hook="import", seconds=limit, late=lambda: late
+            )
     finally:
         timer.cancel()
 
@@ -174,14 +181,19 @@ def _load(
     loaded: Loaded, source: PluginSource, target: str, load: Callable[[], object],
     kinds: Collection[PluginKind] | None = None,
 ) -> None:  # fmt: skip
-    try:
-        plugin = _in_time(source, lambda: f"the import of {target}", load)
+    guard.note_versions({str(source): source.distribution})
+
+    def found() -> tuple[Mapping[str, Callable[..., Any]], list[str]]:
+        plugin = load()
         marked = _marked(plugin)
-    except FAULTS as fault:
-        loaded.broken.append(Broken(source, f"does not import: {describe_plugin_fault(fault)}"))
+        return marked, list(_misspelt(plugin, marked))
+
+    try:
+        marked, misspelt = _in_time(source, lambda: f"the import of {target}", found)
+    except PluginError as fault:
+        loaded.broken.append(Broken(source, f"does not import: {fault}"))
         return
-    for reason in _misspelt(plugin, marked):
-        loaded.broken.append(Broken(source, reason))
+    loaded.broken += [Broken(source, reason) for reason in misspelt]
     for hook, (kind, _) in HOOKS.items():
         if hook in marked and (kinds is None or kind in kinds):
             _take(loaded, source, hook, marked[hook])
@@ -219,22 +231,29 @@ def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..
     def place() -> str:
         return f"{hook} ({definition(function)})"
 
+    def offers() -> list[tuple[Any, str, str]]:
+        """Return each offer with its name and fault; reading them may run code of the plugin."""
+        answer = _call(hook, function)
+        if isinstance(answer, str) or not isinstance(answer, Sequence):
+            given = "None" if answer is None else type(answer).__name__
+            return [(None, "", f" returned {given}, not a list of {wanted.__name__}")]
+        if len(answer) > _MOST_OFFERS:
+            return [(None, "", f" returned {len(answer)} offers; allowed: {_MOST_OFFERS}")]
+        checked = [(one, _fault_of(one, wanted)) for one in answer]
+        return [
+            (one, plain_text(getattr(one, "name", ""))[:64], fault and f": {fault}")
+            for one, fault in checked
+        ]
+
     try:
-        answer = _in_time(source, place, partial(_call, hook, function))
-    except FAULTS as fault:
-        reason = f"{place()} failed with {describe_plugin_fault(fault)}"
+        found = _in_time(source, place, offers)
+    except PluginError as fault:
+        reason = f"{place()} failed with {fault}"
         loaded.broken.append(Broken(source, reason, kind))
         return
-    if isinstance(answer, str) or not isinstance(answer, Sequence):
-        given = "None" if answer is None else type(answer).__name__
-        reason = f"{place()} returned {given}, not a list of {wanted.__name__}"
-        loaded.broken.append(Broken(source, reason, kind))
-        return
-    for offer in answer:
-        fault_found = _fault_of(offer, wanted)
+    for offer, name, fault_found in found:
         if fault_found:
-            name = str(getattr(offer, "name", ""))
-            loaded.broken.append(Broken(source, f"{place()}: {fault_found}", kind, name))
+            loaded.broken.append(Broken(source, f"{place()}{fault_found}", kind, name))
         else:
             loaded.offers.append(Offered(kind, offer, source))
 
@@ -252,8 +271,8 @@ def _call(hook: str, function: Callable[..., Any]) -> Any:
 
 def _fault_of(offer: object, wanted: type[Any]) -> str:
     """Return why an offer cannot be used; "" if it can."""
-    if not isinstance(offer, wanted):
-        return f"offers {offer!r}, which is not a {wanted.__name__}"
+    if type(offer) is not wanted:  # a property of a subclass would run at each access
+        return f"offers {plain_text(repr(offer))}, which is not a {wanted.__name__}"
     name: object = getattr(offer, "name", None)
     if not isinstance(name, str) or not name.strip():
         return f"offers something without a name: {name!r}"
@@ -261,8 +280,12 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
         return f"offers the name {name!r}; allowed: {_NAME_FORM}"
     if not callable(getattr(offer, "create", None)):
         return f"{name!r}: `create` cannot be called"
-    if isinstance(offer, LauncherOffer):
-        return ""  # the configuration does not choose launchers, so they have no options
+    declared = _fault_of_fields(offer, wanted)
+    if isinstance(offer, LauncherOffer):  # the configuration does not choose these: no options
+        if not declared:
+            wrong = [one for one in offer.variables if not _VARIABLE.fullmatch(one)]
+            declared = f"`variables` has the name {wrong[0]!r:.100}" if wrong else ""
+        return f"{name!r}: {declared}" if declared else ""
     options: object = getattr(offer, "options", None)
     if not (isinstance(options, type) and is_dataclass(options)):
         return f"{name!r}: `options` is not a dataclass but {options!r}"
@@ -276,7 +299,22 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     fault = _fault_of_reads(offer) if isinstance(offer, (ScoringOffer, FilterOffer)) else ""
     if isinstance(offer, MigrationOffer):
         fault = _fault_of_executors(offer) or _fault_of_capabilities(offer)
+    fault = fault or declared
     return f"{name!r}: {fault}" if fault else ""
+
+
+def _fault_of_fields(offer: object, wanted: type[Any]) -> str:
+    """Return the first field of an offer that has another type or range than declared; ""."""
+    hints = get_type_hints(wanted)
+    for field in fields(wanted):
+        value: Any = getattr(offer, field.name)
+        fault = fault_of(value, hints[field.name], f"`{field.name}`")
+        least, most = _RANGES.get(field.name, (0.0, 0.0))
+        if not fault and most and not least <= value <= most:
+            fault = f"`{field.name}` is {value!r}; allowed: {least:g} to {most:g}"
+        if fault:
+            return fault
+    return ""
 
 
 def _fault_of_executors(offer: MigrationOffer) -> str:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Executor, Launcher, Probe, ProbeOffer
-from rosrm.extensions.discovery import FAULTS
+from rosrm.extensions.guard import guarded
 from rosrm.model.description_checks import resource_fault
 from rosrm.model.rows import PluginKind
 from rosrm.model.values import (
@@ -226,7 +227,5 @@ def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
 
 def close_quietly(probe: Probe) -> None:
     """Close a probe that is not used; ignore a failure."""
-    try:
-        probe.close()
-    except FAULTS:
-        return
+    with contextlib.suppress(PluginError):
+        guarded(probe.close, whom=f"probe {type(probe).__name__}", hook="close", seconds=1.0)

@@ -16,18 +16,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from inspect import getattr_static, unwrap
 from math import inf
 from types import CodeType, MemberDescriptorType
-from typing import Any, Final, TypeGuard, TypeVar
+from typing import Any, Final, TypeGuard, TypeVar, cast
 
-from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.errors import PluginError, describe_plugin_fault, plain_text
 from rosrm.model.rows import PluginKind
 from rosrm.wording import counted, duration
 
 T = TypeVar("T")
 #: Kind and name of an offer.
 Plugin = tuple[PluginKind, str]
+#: Exceptions that are answers by contract, such as "this host has no such device".
+Answers = tuple[type[Exception], ...]
 #: Function that executes a call; raises `TimeoutError` if the call takes too long.
 Limit = Callable[[Plugin, Callable[[], Any]], Any]
 
@@ -103,8 +106,9 @@ class PluginCalls:
     _running: Plugin | None = None
 
     def ask(
-        self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], of: object = None
-    ) -> T:
+        self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], of: object = None,
+        lets: Answers = (),
+    ) -> T:  # fmt: skip
         """Return the answer of a plugin.
 
         A call within a call of the same plugin has no time-out of its own, because that of the
@@ -116,51 +120,97 @@ class PluginCalls:
             hook: name of the called method, for messages.
             call: calls the method and checks the answer; raises `PluginError` for an invalid one.
             of: object with the method; its place is added to the text about an invalid answer.
+            lets: as in `contained`.
 
         Raises:
             PluginError: the call failed; the text has the error and its place.
         """
         plugin, outer = (kind, name), self._running
-
-        def placed() -> T:
-            try:
-                return call()
-            except PluginError as fault:
-                raise PluginError(with_place(fault, of, hook)) from None
-
+        placed = partial(contained, call, of=of, hook=hook, lets=lets)
         self._running = plugin
         try:
             answer: T = placed() if plugin == outer else self.limit(plugin, placed)
-        except KeyboardInterrupt:  # Ctrl-C of a simulation; a master handles the signal itself
+        except KeyboardInterrupt:  # the user's Ctrl-C in a command or simulation
             raise
-        except BaseException as fault:  # a plugin may raise anything, even SystemExit
+        except BaseException as fault:  # a late call; `contained` has converted any other
+            if isinstance(fault, lets):
+                raise
             reason = describe_plugin_fault(fault)
-            noted = self._failed.setdefault(plugin, Failing())
-            noted.error, noted.count = f"{hook}: {reason}", noted.count + 1
+            self.note(plugin, f"{hook}: {reason}")
             raise PluginError(reason) from fault
         finally:
             self._running = outer
-        if plugin in self.failing:
-            self._worked.add(plugin)
+        self.note(plugin, "")
         return answer
+
+    def note(self, plugin: Plugin, error: str) -> None:
+        """Note the error of a call; "": it succeeded. May be called from any thread."""
+        if error:
+            noted = self._failed.setdefault(plugin, Failing())
+            noted.error, noted.count = error, noted.count + 1
+        elif plugin in self.failing:
+            self._worked.add(plugin)
 
     def changes(self, now: float) -> list[tuple[Plugin, str]]:
         """Return the plugins that began to fail, or to work (""), since the last call."""
         if not self._failed and not self.failing:
             return []
         found: list[tuple[Plugin, str]] = []
-        for plugin, noted in self._failed.items():
+        failed, self._failed = self._failed, {}
+        worked, self._worked = self._worked, set()
+        for plugin, noted in failed.items():
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
                 found.append((plugin, noted.error))
-        for plugin in self._worked - self._failed.keys():
+        for plugin in worked - failed.keys():
             self.failing[plugin].succeeded = True
         for plugin, known in sorted(self.failing.items()):
             if known.succeeded and now - known.last >= WORKS_AFTER:
                 del self.failing[plugin]
                 found.append((plugin, ""))
-        self._failed.clear()
-        self._worked.clear()
         return found
+
+
+def titled(kind: PluginKind, name: str) -> str:
+    """Return kind and name of a plugin, for messages and notes."""
+    return f"{TITLES[kind]} {name!r}"
+
+
+def contained(call: Callable[[], T], *, of: object = None, hook: str = "", lets: Answers = ()) -> T:
+    """Return the answer of plugin code; whatever the code raises becomes a `PluginError`.
+
+    `rosrm.extensions.guard` adds what the core may not do: a time-out and the state of the process.
+
+    Args:
+        call: calls the plugin and checks the answer; raises `PluginError` for an invalid one.
+        of: object with the called method; its place is added to the text about an invalid answer.
+        hook: name of that method.
+        lets: exceptions that are answers by contract. They are raised again as the first class
+            that fits, with a printable text of bounded length.
+
+    Raises:
+        PluginError: the text has the error and its place, and is printable and bounded, too.
+        KeyboardInterrupt: the user's, or the plugin's, which the guard tells apart.
+    """
+    try:
+        return call()
+    except KeyboardInterrupt:
+        raise
+    except BaseException as fault:
+        # By its exact type, because a plugin may raise an error of its own with any methods.
+        if type(fault) is PluginError:
+            said = PluginError(plain_text(_said(fault), lines=True))
+            raise PluginError(with_place(said, of, hook)) from None
+        answer = next((one for one in lets if isinstance(fault, one)), None)
+        if answer is not None:
+            raise answer(plain_text(_said(fault), lines=True)) from None
+        raise PluginError(describe_plugin_fault(fault)) from fault
+
+
+def _said(fault: BaseException) -> str:
+    try:
+        return str(fault)
+    except BaseException:  # noqa: BLE001 - a plugin's exception may fail to give its text
+        return describe_plugin_fault(fault)
 
 
 def implements(plugin: object, contract: Callable[..., T]) -> TypeGuard[T]:
@@ -176,10 +226,13 @@ def implements(plugin: object, contract: Callable[..., T]) -> TypeGuard[T]:
 
 
 def required(answer: object, kind: type[T]) -> T:
-    """Return an answer of the required type; raise `PluginError` for any other."""
+    """Return an answer of the required type; raise `PluginError` for any other.
+
+    A text is returned as a printable `str` of bounded length; newlines stay.
+    """
     if not isinstance(answer, kind):
         raise PluginError(f"answered {given(answer)}; {kind.__name__} is required")
-    return answer
+    return cast(T, plain_text(answer, lines=True)) if kind is str else answer
 
 
 def with_place(fault: PluginError, owner: object, method: str) -> str:
@@ -209,4 +262,4 @@ def _place_of(owner: object, name: str) -> str:
 
 def given(answer: object) -> str:
     """Return the type of a wrong answer, for messages."""
-    return "None" if answer is None else f"a {type(answer).__name__}"
+    return "None" if answer is None else f"a {plain_text(type(answer).__name__)[:100]}"

@@ -9,9 +9,12 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache, partial
+from itertools import islice
 from typing import Any, Final, TypeVar, cast
 
-from rosrm.errors import ConfigError, PluginError, SkipPlugin, describe_fault, describe_plugin_fault
+from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.extensions import guard
+from rosrm.extensions.answers import whole
 from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointPolicy,
@@ -31,7 +34,6 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.discovery import (
-    FAULTS,
     Broken,
     ChosenOffer,
     Loaded,
@@ -42,6 +44,7 @@ from rosrm.extensions.discovery import (
     load_addresses,
     load_objects,
 )
+from rosrm.extensions.guard import guarded, note_versions
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.extensions.made import (
     MadeLauncher,
@@ -58,17 +61,18 @@ from rosrm.extensions.made import (
 )
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.placement import ScoringLink, SelectedFilter
-from rosrm.extensions.plugin_calls import TITLES, Plugin, implements, required
+from rosrm.extensions.plugin_calls import TITLES, Answers, Plugin, PluginCalls, implements, titled
 from rosrm.extensions.sinks import EventSink
-from rosrm.extensions.time_limit import limited
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.rows import PluginKind, PluginRow, PluginState
 from rosrm.model.values import (
     EMPTY,
+    RESOURCE_SLOTS,
     MigrationPolicy,
     ProcessSpec,
+    ResourceDescription,
 )
-from rosrm.wording import counted, get_close_matches
+from rosrm.wording import counted, get_close_matches, sanitized
 
 #: Distribution with rosrm's own plugins of each kind, for messages if none is installed.
 _SHIPPED_IN: Final[Mapping[PluginKind, str]] = {
@@ -84,9 +88,6 @@ MASTER_KINDS: Final[tuple[PluginKind, ...]] = ("scoring", "filter", "migration",
 #: Kinds of the plugins that slaves use.
 SLAVE_KINDS: Final[tuple[PluginKind, ...]] = ("probe", "migration", "launcher")
 
-#: Time-out of `create` in seconds; it may load a large library.
-CREATE_LIMIT: Final = 30.0
-
 #: Highest number of broken plugins in a message if the intended one is unknown.
 _MOST_BROKEN: Final = 3
 
@@ -97,13 +98,21 @@ T = TypeVar("T")
 
 
 class Registry:
-    """The plugins of this installation; `discover` creates it."""
+    """The plugins of this installation; `discover` creates it.
+
+    Attributes:
+        calls: guard and record of the calls of the plugins that this process uses.
+    """
 
     def __init__(self, loaded: Loaded) -> None:
         self._offers: dict[Plugin, Offered] = {}
         self._broken: list[Broken] = list(loaded.broken)
         self._outcome: dict[Plugin, tuple[PluginState, str]] = {}
+        self.calls = PluginCalls()
         self._keep_single(loaded.offers)
+        note_versions({
+            titled(*key): offered.source.distribution for key, offered in self._offers.items()
+        })  # fmt: skip
         self._refuse_shared_executors()
 
     @classmethod
@@ -176,12 +185,12 @@ class Registry:
         rows = []
         for (kind, name), offered in sorted(self._offers.items()):
             state, reason = self._outcome.get((kind, name), ("available", offered.offer.summary))
+            reason = sanitized(reason)
             rows.append(PluginRow(kind, name, offered.source.distribution, state, reason, host))
         for broken in self._broken:
             kind, name = broken.kind or "plugin", broken.name or broken.source.plugin
-            rows.append(
-                PluginRow(kind, name, broken.source.distribution, "broken", broken.reason, host)
-            )
+            reason = sanitized(broken.reason)
+            rows.append(PluginRow(kind, name, broken.source.distribution, "broken", reason, host))
         return [row for row in rows if not kinds or row.kind in (*kinds, "plugin")]
 
     # --- creation -----------------------------------------------------------------------------
@@ -230,16 +239,13 @@ class Registry:
         """Refuse a strategy with a `host_check` or `discard` that its own offer lacks."""
         own = self._strategy(name).executors
         for kind, named in ((HostChecking, "host_check"), (PeriodicImaging, "discard")):
-            fault = ""
-            try:
-                if implements(strategy, kind) and (executor := getattr(strategy, named)) not in own:
-                    there = ", ".join(sorted(own)) or "none"
-                    fault = f"its `{named}` is {executor!r}, no executor of its offer; "
-                    fault += f"there are: {there}"
-            except FAULTS as raised:
-                fault = f"its `{named}` raised {describe_plugin_fault(raised)}"
-            if fault:
-                raise self._fault("migration", name, fault)
+            if not implements(strategy, kind):
+                continue
+            executor = self._guarded("migration", name, named, partial(getattr, strategy, named))
+            if not (isinstance(executor, str) and executor in own):
+                there = ", ".join(sorted(own)) or "none"
+                fault = f"its `{named}` is {executor!r:.100}, no executor of its offer; "
+                raise self._fault("migration", name, f"{fault}there are: {there}")
 
     def declared(self, chosen: NameToOptions) -> Declared:
         """Return the declarations in the offers of migration strategies."""
@@ -279,10 +285,31 @@ class Registry:
     ) -> Callable[[ProcessSpec], Capabilities]:
         """Return a function that returns the capabilities of the strategy of a process.
 
-        A strategy that is not installed here, or that fails, has no capabilities.
+        A strategy that is not installed here has no capabilities. A strategy that fails has those
+        of its last answer, or none.
 
         Args:
             chosen: strategies with their options for all processes.
+        """
+        found = self.capabilities_or_fault(chosen)
+        last: dict[str, Capabilities] = {}
+
+        def known(spec: ProcessSpec) -> Capabilities:
+            name = spec.migration.strategy or ""
+            try:
+                last[name] = found(spec)
+            except PluginError:  # the guard has recorded it
+                return last.get(name, _NO_CAPABILITIES)
+            return last[name]
+
+        return known
+
+    def capabilities_or_fault(
+        self, chosen: NameToOptions = EMPTY
+    ) -> Callable[[ProcessSpec], Capabilities]:
+        """Return a function as `capabilities_of`, which raises `PluginError` if a strategy fails.
+
+        A start needs it, because without its launcher the process would be another one.
         """
         options = self._options(chosen)
 
@@ -293,10 +320,12 @@ class Registry:
             declared = self._strategy(name).capabilities
             if isinstance(declared, Capabilities):
                 return declared
-            try:
-                return required(declared(options(name, spec)), Capabilities)
-            except FAULTS:
-                return _NO_CAPABILITIES
+            function = declared
+
+            def ask() -> Capabilities:
+                return cast(Capabilities, whole(function(options(name, spec)), Capabilities))
+
+            return self.calls.ask("migration", name, "capabilities", ask)
 
         return found
 
@@ -337,10 +366,12 @@ class Registry:
         }
 
     def _host_options(self, name: str, given: Mapping[str, Any]) -> Mapping[str, Any]:
+        wanted = self._strategy(name).host_options
         try:
-            return cast(
-                Mapping[str, Any], to_plain(from_plain(self._strategy(name).host_options, given))
-            )
+            return cast(Mapping[str, Any], self._guarded(
+                "migration", name, "host_options", lambda: to_plain(from_plain(wanted, given)),
+                (ValueError,),
+            ))  # fmt: skip
         except ValueError as wrong:
             raise ConfigError(f"strategies: options of {name!r}: {wrong}") from wrong
 
@@ -390,22 +421,37 @@ class Registry:
     ) -> MadeProbe:
         offer = cast(ProbeOffer, self.offer("probe", name))
         probe = self._make("probe", name, options, context)
-        try:
-            resources = tuple(probe.resources)
+
+        def described() -> tuple[tuple[ResourceDescription, ...], dict[str, str]]:
+            resources = tuple(islice(probe.resources, RESOURCE_SLOTS + 1))
             labels = probe.labels if implements(probe, HostLabelling) else EMPTY
             fault = (
                 fault_of_resources(resources, offer, before)
                 or unmeasured(probe, resources)
                 or fault_of_labels(labels, before)
             )
-            fault = fault and f"{type(probe).__name__} ({definition(type(probe))}) {fault}"
-        except FAULTS as raised:
-            resources, labels = (), EMPTY
-            fault = f"its `resources` or `labels` raised {describe_plugin_fault(raised)}"
-        if fault:
+            if fault:
+                raise PluginError(f"{type(probe).__name__} ({definition(type(probe))}) {fault}")
+            return resources, dict(labels)
+
+        try:
+            resources, labels = self._guarded("probe", name, "resources` or `labels", described)
+        except PluginError:
             close_quietly(probe)
-            raise self._fault("probe", name, fault)
-        return MadeProbe(name, probe, resources, offer.period, offer.deadline, dict(labels))
+            raise
+        return MadeProbe(name, probe, resources, offer.period, offer.deadline, labels)
+
+    def _guarded(
+        self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], lets: Answers = ()
+    ) -> T:
+        """Return the answer of an object that an offer created; `PluginError` marks it broken."""
+        try:
+            return guarded(call, whom=titled(kind, name), hook=hook, lets=lets)
+        except PluginError as fault:
+            own = fault.__cause__ is None  # rosrm's sentence on an invalid answer
+            raise self._fault(
+                kind, name, str(fault) if own else f"its `{hook}` raised {fault}"
+            ) from fault
 
     def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
         """Create an object that the master needs, so that its absence here is an error."""
@@ -418,12 +464,14 @@ class Registry:
     def _make(self, kind: PluginKind, name: str, options: Mapping[str, Any], *more: Any) -> Any:
         offer = self.offer(kind, name)
         try:
-            settings = from_plain(offer.options, options)
+            settings = guarded(
+                partial(from_plain, offer.options, options), whom=titled(kind, name),
+                hook="options", lets=(ValueError,),
+            )  # fmt: skip
         except ValueError as wrong:
             raise ConfigError(f"options of {TITLES[kind]} {name!r}: {wrong}") from wrong
-        except FAULTS as fault:
-            reason = f"its options cannot be read: {describe_fault(fault)}"
-            raise self._fault(kind, name, reason) from fault
+        except PluginError as fault:
+            raise self._fault(kind, name, f"its options cannot be read: {fault}") from fault
         return self._create(kind, name, offer, settings, *more)
 
     def _create(self, kind: PluginKind, name: str, offer: Offer, *given: Any) -> Any:
@@ -431,18 +479,22 @@ class Registry:
 
         def late() -> str:
             return (
-                f"it did not return within {CREATE_LIMIT:g} s; correct what blocks it, or leave "
-                f"{name!r} out of the configuration"
+                f"it did not return within {guard.LOADING_LIMIT:g} s; correct what blocks it, or "
+                f"leave {name!r} out of the configuration"
             )
 
+        def made() -> tuple[Any, str]:
+            thing = create(*given)
+            return thing, missing_method(kind, thing)
+
         try:
-            thing = limited(CREATE_LIMIT, partial(create, *given), late)
-        except (SkipPlugin, ConfigError):  # not a fault of the plugin
-            raise
-        except FAULTS as fault:
-            reason = f"`create` ({definition(create)}) raised {describe_plugin_fault(fault)}"
+            thing, lacks = guarded(
+                made, whom=titled(kind, name), hook="create", seconds=guard.LOADING_LIMIT,
+                late=late, lets=(SkipPlugin, ConfigError),  # not a fault of the plugin
+            )  # fmt: skip
+        except PluginError as fault:
+            reason = f"`create` ({definition(create)}) raised {fault}"
             raise self._fault(kind, name, reason) from fault
-        lacks = missing_method(kind, thing)
         if lacks:
             raise self._fault(kind, name, f"`create` ({definition(create)}) made {lacks}")
         self._outcome[kind, name] = ("selected", offer.summary)

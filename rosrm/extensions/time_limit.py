@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import inspect
 import logging
+import os
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable
+from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar, Final, TypeVar
 
@@ -28,6 +30,8 @@ _AGAIN: Final = 0.05
 #: Seconds between the further alarms. The trace function gets through one `try` of each function;
 #: with several around each other, some alarm must come between them.
 _SOON: Final = 0.001
+#: Seconds between two looks for an overdue call that no alarm has interrupted.
+_WATCH_PERIOD: Final = 0.5
 #: Seconds between two log lines on a call that does not end.
 _LOG_PERIOD: Final = 5.0
 
@@ -44,7 +48,15 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
-    alarm = _Alarm(inspect.currentframe())
+    _Watch.ensure()
+    try:
+        return _limited(seconds, call, late)
+    except _Interrupt:  # of the watch, at the very end of the call
+        raise TimeoutError(late()) from None
+
+
+def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T:
+    alarm = _Alarm(inspect.currentframe(), time.monotonic() + seconds)
     outer, _Alarm.ringing = _Alarm.ringing, alarm
     # A process has one timer, so that of a test runner or of an outer limit is restored afterwards.
     before = signal.signal(signal.SIGALRM, _ring)
@@ -71,8 +83,14 @@ def _ring(number: int, frame: FrameType | None) -> None:
         _Alarm.ringing.ring(number, frame)
 
 
+#: Files of the guard, which restores what a late call has changed, so it is not interrupted.
+_OWN: Final = frozenset({
+    __file__, *(str(Path(__file__).with_name(f"{one}.py")) for one in ("guard", "process_state")),
+})  # fmt: skip
+
+
 def _is_own(frame: FrameType | None) -> bool:
-    return frame is not None and frame.f_code.co_filename == __file__
+    return frame is not None and frame.f_code.co_filename in _OWN
 
 
 class _Interrupt(BaseException):
@@ -84,31 +102,35 @@ class _Alarm:
 
     Args:
         guard: the frame that executes the call; it is not interrupted itself.
+        deadline: monotonic time of the first alarm.
 
     Attributes:
         ringing: that of the innermost running call.
         interrupt: the newest interrupt; None if the call ended in time.
+        is_running: True until the call has ended.
     """
 
     ringing: ClassVar[_Alarm | None] = None
 
-    def __init__(self, guard: FrameType | None) -> None:
+    def __init__(self, guard: FrameType | None, deadline: float) -> None:
         self.interrupt: _Interrupt | None = None
+        self.deadline = deadline
         self._guard = guard
-        self._running = True
+        self.is_running = True
         self._rung_at = self._logged_at = 0.0
         self._before = (sys.gettrace(), sys.getprofile())
 
     def stop(self) -> None:
         """Interrupt nothing from now on."""
-        self._running, self._guard = False, None  # the frame refers to this object
+        with _Watch.lock:
+            self.is_running, self._guard = False, None  # the frame refers to this object
         if self.interrupt is not None:
             sys.settrace(self._before[0])
             sys.setprofile(self._before[1])
 
     def ring(self, _signal: int, frame: FrameType | None) -> None:
         """Interrupt the call: handle the signal of the timer."""
-        if not self._running or _is_own(frame):  # the call ended at the last moment
+        if not self.is_running or _is_own(frame):  # the call ended at the last moment
             return
         sys.settrace(None)
         sys.setprofile(None)
@@ -118,6 +140,16 @@ class _Alarm:
             signal.setitimer(signal.ITIMER_REAL, _SOON, _SOON)
         self._rung_at = self._rung_at or time.monotonic()
         raise self._next_interrupt()
+
+    def force(self) -> None:
+        """Interrupt an overdue call from another thread, as its own alarm was taken or stopped."""
+        main = threading.main_thread().ident or 0
+        handler = signal.getsignal(signal.SIGALRM)
+        if handler is not _ring:
+            self._next_interrupt()
+            interrupt_thread(main)
+        if callable(handler):  # ends a blocking call; the default action would end the process
+            signal.pthread_kill(main, signal.SIGALRM)
 
     def _next_interrupt(self) -> _Interrupt:
         self.interrupt = _Interrupt("a plugin was interrupted, because its call took too long")
@@ -144,12 +176,45 @@ class _Alarm:
             frame = frame.f_back
 
     def _trace(self, frame: FrameType, event: str, _argument: Any) -> Any:
-        if not self._running or _is_own(frame):
+        if not self.is_running or _is_own(frame):
             return None
         if event == "line":
             raise self._next_interrupt()
         return self._trace
 
     def _profile(self, frame: FrameType, event: str, _argument: Any) -> None:
-        if event == "return" and self._running:
+        if event == "return" and self.is_running:
             self._trace_from(frame.f_back)
+
+
+class _Watch:
+    """Thread that interrupts an overdue call whose plugin has taken or stopped the alarm."""
+
+    lock: ClassVar[threading.Lock] = threading.Lock()
+    _pid: ClassVar[int] = 0
+
+    @classmethod
+    def ensure(cls) -> None:
+        """Start the thread, unless this process has it already."""
+        if cls._pid != os.getpid():
+            cls._pid, cls.lock = os.getpid(), threading.Lock()
+            threading.Thread(target=cls._watch, name="rosrm-plugins", daemon=True).start()
+
+    @classmethod
+    def _watch(cls) -> None:
+        while True:
+            time.sleep(_WATCH_PERIOD)
+            alarm = _Alarm.ringing
+            if alarm is None or time.monotonic() < alarm.deadline + _WATCH_PERIOD:
+                continue
+            with cls.lock:
+                if alarm.is_running:
+                    alarm.force()
+            del alarm
+
+
+def interrupt_thread(ident: int) -> None:
+    """Raise an exception in a thread at its next line of Python; a blocking call is not ended."""
+    import ctypes  # noqa: PLC0415 - seldom needed, and the runtimes' memory is budgeted
+
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(_Interrupt))

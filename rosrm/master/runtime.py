@@ -37,13 +37,14 @@ from rosrm.errors import JournalBlocked, Refused
 from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import PlacementPlugins
+from rosrm.extensions.plugin_deadline import Deadlines
+from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys.finding import master_security
 from rosrm.master.diagnostics import DiagnosticsFeed
 from rosrm.master.grants_watch import GrantsWatch
 from rosrm.master.journal_stall import JournalStall
-from rosrm.master.plugin_deadline import Deadlines
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
 from rosrm.master.settings_reload import SettingsReload
@@ -139,7 +140,7 @@ class MasterRuntime:
         self._stopping = ""
         self._recorder: Recorder | None = None
         self._held: JournalStall | None = None
-        self._deadlines = Deadlines()
+        self._deadlines = Deadlines(min(CALL_LIMIT, config.liveness.lease / 4.0))
         self._from_threads: deque[Callable[[], None]] = deque()
         self._behind = 0.0  # seconds that the core's clock is behind: its start and blocked time
         self._closing = contextlib.ExitStack()

@@ -11,17 +11,20 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from rosrm.errors import Refused, RosrmError, describe_fault, describe_plugin_fault
+from rosrm.errors import PluginError, Refused, RosrmError
 from rosrm.extensions.contracts import Executor
 from rosrm.extensions.discovery import definition
+from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import OfferedExecutor
-from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given
+from rosrm.extensions.plugin_calls import WORKS_AFTER, Plugin, given, titled
 from rosrm.ros.slave.services import ExecutorOutcome
 
 _log = logging.getLogger("rosrm.slave")
 
 #: Marks an error that is too recent to forget, although a later call has succeeded.
 _SINCE: Final = "; it has succeeded since"
+#: Most letters of a result, as the master accepts it.
+MOST_LETTERS_OF_RESULT: Final = 1 << 20
 #: Takes the outcome of an executor.
 Done = Callable[[ExecutorOutcome], None]
 
@@ -100,9 +103,7 @@ class Executors:
             done(outcome)
 
         def work() -> None:
-            # The last line of a slave that an executor ended, for example by `os._exit`.
-            _log.debug("the executor %s of %s begins (%s)", name, strategy, place)
-            outcome = _outcome(name, function, complete)
+            outcome = _outcome(titled("migration", strategy), name, function, complete)
             timer.cancel()
             self._post(partial(settle, outcome))
 
@@ -128,9 +129,12 @@ class Executors:
             self._changed(f"migration strategy {strategy} has succeeded since its last failure")
 
 
-def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> ExecutorOutcome:
+def _outcome(
+    whom: str, name: str, function: Executor, arguments: Mapping[str, Any]
+) -> ExecutorOutcome:
     """Run an executor; return its outcome."""
-    try:
+
+    def run() -> ExecutorOutcome:
         result: object = function(arguments)
         if not isinstance(result, Mapping):
             wrong = f"{name} answered {given(result)}; a JSON object is required"
@@ -139,13 +143,20 @@ def _outcome(name: str, function: Executor, arguments: Mapping[str, Any]) -> Exe
         if strange:
             wrong = f"{name} answered something that is no JSON: {strange}"
             return ExecutorOutcome("bad_result", wrong)
-        return ExecutorOutcome("", result=json.dumps(result, default=dict))
+        text = json.dumps(result, default=dict)
+        if len(text) > MOST_LETTERS_OF_RESULT:
+            wrong = f"{name} answered {len(text)} bytes; allowed: {MOST_LETTERS_OF_RESULT}"
+            return ExecutorOutcome("bad_result", wrong)
+        return ExecutorOutcome("", result=text)
+
+    try:
+        return guarded(run, whom=whom, hook=f"executor {name}", lets=(RosrmError, ValueError))
     except RosrmError as error:
+        if isinstance(error, PluginError):
+            return ExecutorOutcome("failed", f"{name} raised {error}")
         return ExecutorOutcome("unable", str(error))
     except ValueError as error:
-        return ExecutorOutcome("unable", f"{name}: {describe_fault(error)}")
-    except BaseException as error:  # noqa: BLE001 - a third party's code, which may call sys.exit
-        return ExecutorOutcome("failed", f"{name} raised {describe_plugin_fault(error)}")
+        return ExecutorOutcome("unable", f"{name}: {error}")
 
 
 def _no_json(value: object, path: str) -> str:

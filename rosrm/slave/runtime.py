@@ -25,6 +25,8 @@ from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
+from rosrm.extensions.plugin_calls import TITLES
+from rosrm.extensions.plugin_deadline import Deadlines
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
@@ -65,7 +67,8 @@ from rosrm.slave.health import HealthWatch
 from rosrm.slave.interfaces import own_address
 from rosrm.slave.launch.ament_index import search_path
 from rosrm.slave.launch.components import filled_component
-from rosrm.slave.launch.launchers import Launchers
+from rosrm.slave.launch.lanes import Lanes
+from rosrm.slave.launch.launchers import ASK_LIMIT, PREPARE_LIMIT, Launchers
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import newest_instance, nothing_yet, read_log
@@ -145,7 +148,9 @@ class SlaveRuntime:
             offered = registry.launchers(
                 LauncherContext(config.state, sys.executable, self._incarnation)
             )
-            launchers = Launchers.of(offered, registry.capabilities_of())
+            self._calls = registry.calls
+            self._calls.limit = Deadlines(ASK_LIMIT)
+            launchers = Launchers.of(offered, registry.capabilities_or_fault(), self._calls)
             self._launchers = tuple(launchers.made)
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
@@ -177,7 +182,8 @@ class SlaveRuntime:
             self._serve_master(max_age)
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
-                self._replication, self._artifacts, graph, sessions, launchers, take=self._take,
+                self._replication, self._artifacts, graph, sessions, launchers,
+                Lanes(self._post, PREPARE_LIMIT), take=self._take,
                 instance_key=lambda one: security.instance_key(one.process, one.number),
             )  # fmt: skip
             self._ending = Shutdown(
@@ -228,9 +234,8 @@ class SlaveRuntime:
 
     def _note_broken(self, launchers: Mapping[str, str]) -> None:
         """Log and report the plugins that are broken on this host from the start."""
-        self._endpoint.failing.update(self._executors.failing_plugins())
-        for name, reason in launchers.items():
-            self._endpoint.failing["launcher", name] = reason
+        self._broken_launchers = dict(launchers)
+        self._collect_failing()
         for strategy, reason in self._executors.failing.items():
             _log.info("migration strategy %s is broken: %s", strategy, reason)
 
@@ -355,6 +360,7 @@ class SlaveRuntime:
                 next_usage = now + _USAGE_PERIOD
                 self._clients.expire(now)
                 guard.call(self._usage.look, now, self._sampler.by_process)
+                guard.call(self._note_calls, now)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
@@ -471,11 +477,27 @@ class SlaveRuntime:
     def _note_executors(self, message: str) -> None:
         """Log which migration strategy fails or works again, and report that to the master."""
         _log.info("%s", message)
-        failing = self._endpoint.failing
-        for plugin in [one for one in failing if one[0] == "migration"]:
-            del failing[plugin]
-        failing.update(self._executors.failing_plugins())
+        self._collect_failing()
         self._endpoint.publish_statuses((), complete=False)
+
+    def _note_calls(self, now: float) -> None:
+        """Log which launcher or strategy fails or works again, and report that to the master."""
+        changes = self._calls.changes(now)
+        for (kind, name), error in changes:
+            outcome = f"fails: {error}" if error else "works again"
+            _log.info("the %s %r %s", TITLES[kind], name, outcome)
+        if changes:
+            self._collect_failing()
+            self._endpoint.publish_statuses((), complete=False)
+
+    def _collect_failing(self) -> None:
+        """Collect the failing launchers and strategies; probes report their own changes."""
+        failing = self._endpoint.failing
+        for plugin in [one for one in failing if one[0] != "probe"]:
+            del failing[plugin]
+        failing.update({("launcher", name): why for name, why in self._broken_launchers.items()})
+        failing.update(self._executors.failing_plugins())
+        failing.update({plugin: one.error for plugin, one in self._calls.failing.items()})
 
     def _publish_usage(self) -> None:
         seen = self._usage.after_reading()

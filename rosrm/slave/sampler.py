@@ -29,11 +29,13 @@ import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
-from rosrm.errors import PluginError, describe_plugin_fault
-from rosrm.extensions.plugin_calls import with_place
+from rosrm.errors import PluginError
+from rosrm.extensions.guard import guarded
+from rosrm.extensions.plugin_calls import titled
 from rosrm.model.devices import Device
 from rosrm.model.values import EMPTY, MOST_USED, RESOURCE_SLOTS
 from rosrm.slave.probe_reads import UsageByProcess, read_devices, read_processes, read_values
@@ -313,6 +315,7 @@ class _Watched:
         self, made: MadeProbe, first: int, clock: Callable[[], float], progress: threading.Event,
     ) -> None:  # fmt: skip
         self.name = made.name
+        self._title = titled("probe", made.name)
         self.names = tuple(resource.name for resource in made.resources)
         self.deadline = made.deadline
         self.slots = slice(first, first + len(self.names))
@@ -385,11 +388,7 @@ class _Watched:
 
     def close(self) -> None:
         """Close the probe, in the thread that reads it."""
-        try:
-            self._probe.close()
-        except BaseException:  # noqa: BLE001 - a plugin's error must not stop the slave's end
-            return
-        self.closed = True
+        self.closed = self._guarded("close", self._probe.close)[1] == ""
 
     def _read(self) -> None:
         started = self._clock()
@@ -415,10 +414,9 @@ class _Watched:
         self, name: str, call: Callable[..., _T], *arguments: Any
     ) -> tuple[_T | None, str]:
         """Return the result of a call of the probe, or None and why it failed."""
+        ask = partial(call, *arguments)
         try:
-            return call(*arguments), ""
-        except PluginError as nonsense:
-            return None, with_place(nonsense, self._probe, name)
-        except BaseException as error:  # noqa: BLE001 - the guard: whatever a plugin raises, even
-            # SystemExit, makes its readings stale and harms nothing else.
-            return None, f"{name}() raised {describe_plugin_fault(error)}"
+            return guarded(ask, whom=self._title, hook=name, of=self._probe), ""
+        except PluginError as fault:
+            is_answer = fault.__cause__ is None  # the sentence is rosrm's, on an invalid answer
+            return None, str(fault) if is_answer else f"{name}() raised {fault}"

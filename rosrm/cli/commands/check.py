@@ -15,7 +15,8 @@ import typer
 
 from rosrm.cli.groups import DISTRIBUTIONS
 from rosrm.cli.output.plain import echo
-from rosrm.errors import ConfigError, PluginError, describe_plugin_fault
+from rosrm.errors import ConfigError, PluginError
+from rosrm.extensions.guard import guarded
 from rosrm.wording import counted, get_close_matches, listed
 
 if TYPE_CHECKING:
@@ -197,14 +198,14 @@ def _check_of_simulations(file: Path) -> Callable[[Path, Registry], str]:
 
     for address in installed_plugins(CHECKS):
         if address.name == "simulation":
+            load: Callable[[], Callable[[Path, Registry], str]] = partial(
+                resolve_name, address.target
+            )
+            whom = f"the check of simulation files of {address.distribution}"
             try:
-                check: Callable[[Path, Registry], str] = resolve_name(address.target)
-            except Exception as fault:  # noqa: BLE001 - code of another distribution
-                reason = f"cannot be loaded: {describe_plugin_fault(fault)}"
-                raise PluginError(
-                    f"the check of simulation files of {address.distribution} {reason}"
-                ) from None
-            return check
+                return guarded(load, whom=whom, hook="import")
+            except PluginError as fault:
+                raise PluginError(f"{whom} cannot be loaded: {fault}") from None
     needed = DISTRIBUTIONS["simulate"]
     raise ConfigError(f"{file}: the check of a simulation file comes with `pip install {needed}`")
 

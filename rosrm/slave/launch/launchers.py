@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import partial
-from typing import Final, TypeVar
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, TypeVar
 
-from rosrm.errors import LaunchError, PluginError, RosrmError, describe_plugin_fault
+from rosrm.errors import LaunchError, PluginError, RosrmError
+from rosrm.extensions.answers import whole
 from rosrm.extensions.contracts import (
     Capabilities,
     GraphDepartureLauncher,
@@ -16,10 +19,9 @@ from rosrm.extensions.contracts import (
     Launch,
     ProcessTreeLauncher,
 )
-from rosrm.extensions.discovery import FAULTS
+from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import MadeLauncher, MadeLaunchers
-from rosrm.extensions.plugin_calls import implements, required, with_place
-from rosrm.extensions.time_limit import limited
+from rosrm.extensions.plugin_calls import PluginCalls, implements, required, titled
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 
 T = TypeVar("T")
@@ -27,8 +29,13 @@ L = TypeVar("L")
 
 _log = logging.getLogger("rosrm.slave")
 
-#: Seconds for `prepare`: the loop of the slave waits for it.
+#: Seconds for `prepare`, in a thread of its own: the start waits for it, the slave does not.
 PREPARE_LIMIT: Final = 10.0
+#: Seconds for any other call of a launcher, for which the slave's loop waits.
+ASK_LIMIT: Final = 0.5
+#: Most processes of an instance, and the highest pid of a kernel.
+MOST_MEMBERS: Final = 32_768
+_HIGHEST_PID: Final = 1 << 22
 
 
 def _no_capabilities(_spec: ProcessSpec) -> Capabilities:
@@ -42,25 +49,29 @@ class Launchers:
     Attributes:
         made: by name.
         unusable: name to the reason, of those that are absent or broken here.
-        capabilities_of: names the launcher of a process.
+        capabilities_of: names the launcher of a process; raises `PluginError` if that is unknown.
+        calls: guard and record of the calls.
     """
 
     made: Mapping[str, MadeLauncher] = field(default_factory=lambda: EMPTY)
     unusable: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     capabilities_of: Callable[[ProcessSpec], Capabilities] = _no_capabilities
-    _logged: dict[str, str] = field(init=False, default_factory=dict)
+    calls: PluginCalls = field(default_factory=PluginCalls)
+    _since: dict[str, float] = field(init=False, default_factory=dict)
+    _locks: dict[str, threading.Lock] = field(init=False, default_factory=dict)
 
     @classmethod
     def of(
-        cls, offered: MadeLaunchers, capabilities_of: Callable[[ProcessSpec], Capabilities]
-    ) -> Launchers:
+        cls, offered: MadeLaunchers, capabilities_of: Callable[[ProcessSpec], Capabilities],
+        calls: PluginCalls,
+    ) -> Launchers:  # fmt: skip
         """Return the launchers of this host; log which of them cannot be used, and why."""
         absent = {name: f"absent: {reason}" for name, reason in offered.absent.items()}
         broken = {name: f"broken: {reason}" for name, reason in offered.broken.items()}
         unusable = {**absent, **broken}
         for name, reason in unusable.items():
             _log.info("launcher %s is %s", name, reason)
-        return cls(offered.made, unusable, capabilities_of)
+        return cls(offered.made, unusable, capabilities_of, calls)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -68,53 +79,88 @@ class Launchers:
         return tuple(variable for one in self.made.values() for variable in one.variables)
 
     def prepare(self, launch: Launch) -> Launch:
-        """Return the launch as the launcher of its process changes it.
+        """Return the launch as the launcher of its process changes it; may take `PREPARE_LIMIT`.
 
         Raises:
             LaunchError: the instance cannot be started here.
         """
         instance, restored = launch.assignment.instance, launch.assignment.restored
-        spec = launch.assignment.spec
-        own = spec.container.engine or self.capabilities_of(spec).launcher
+        own = self._launcher_of(launch)
         if own and own not in self.made:
             reason = self.unusable.get(own, "not installed")
             raise LaunchError(f"{instance} needs the launcher {own!r}, which is {reason}")
         # The image of a process that moves by another strategy may be of any that makes images.
         others = [name for name in self.made if name != own] if restored else []
+        faults: list[str] = []
         for name in [*([own] if own else []), *others]:
-            prepared = self._prepare(name, launch)
+            try:
+                prepared = self._prepare(name, launch)
+            except PluginError as fault:
+                if name == own:
+                    raise LaunchError(str(fault)) from None
+                faults.append(str(fault))
+                continue
             if prepared is not None:
                 return prepared
         if restored:
-            raise LaunchError(f"{instance} cannot be restored: no launcher here has an image of it")
+            why = "; ".join(["no launcher here has an image of it", *faults])
+            raise LaunchError(f"{instance} cannot be restored: {why}")
         return launch
 
-    def _prepare(self, name: str, launch: Launch) -> Launch | None:
-        call = partial(self.made[name].launcher.prepare, launch)
-        late = f"it took longer than {PREPARE_LIMIT:g} s"
+    def _launcher_of(self, launch: Launch) -> str:
+        spec = launch.assignment.spec
+        if spec.container.engine:
+            return spec.container.engine
         try:
-            prepared = limited(PREPARE_LIMIT, call, lambda: late)
-            return None if prepared is None else required(prepared, Launch)
-        except PluginError as wrong:
-            text = with_place(wrong, self.made[name].launcher, "prepare")
-            raise LaunchError(f"the launcher {name!r} fails: prepare: {text}") from None
+            return self.capabilities_of(spec).launcher
+        except PluginError as fault:
+            raise LaunchError(
+                f"{launch.assignment.instance}: the launcher of the migration strategy "
+                f"{spec.migration.strategy!r} is not known: capabilities: {fault}"
+            ) from None
+
+    def _prepare(self, name: str, launch: Launch) -> Launch | None:
+        """Call one launcher, after its other calls; raises `PluginError` or `LaunchError`."""
+        launcher: Any = self.made[name].launcher
+        lock = self._locks.setdefault(name, threading.Lock())
+        began = self._since.get(name, time.monotonic())
+        if not lock.acquire(timeout=max(0.0, began + PREPARE_LIMIT - time.monotonic())):
+            raise PluginError(
+                f"the launcher {name!r} fails: prepare: an earlier call has not ended"
+            )
+
+        def ask() -> Launch | None:
+            prepared = launcher.prepare(launch)
+            return None if prepared is None else _checked(launch, required(prepared, Launch))
+
+        try:
+            self._since[name] = time.monotonic()
+            prepared = guarded(
+                ask, whom=titled("launcher", name), hook="prepare", seconds=PREPARE_LIMIT,
+                of=launcher, lets=(LaunchError, RosrmError, ValueError),
+            )  # fmt: skip
+        except PluginError as fault:
+            self.calls.note(("launcher", name), f"prepare: {fault}")
+            raise PluginError(f"the launcher {name!r} fails: prepare: {fault}") from None
+        except LaunchError:
+            raise
         except (RosrmError, ValueError) as error:
-            if isinstance(error, LaunchError):
-                raise
             raise LaunchError(f"{launch.assignment.instance}: {error}") from None
-        except FAULTS as fault:
-            reason = f"the launcher {name!r} fails: prepare: {describe_plugin_fault(fault)}"
-            raise LaunchError(reason) from fault
+        finally:
+            self._since.pop(name, None)
+            lock.release()
+        self.calls.note(("launcher", name), "")
+        return prepared
 
     def discard_images(self, instance: InstanceId) -> None:
         """Have the next start of an instance begin from nothing."""
         for name, launcher in self._of(ImageLauncher):
-            self._ask(name, "discard_images", partial(launcher.discard_images, instance), None)
+            self._ask(name, "discard_images", launcher, None, object, instance)
 
     def has_departed(self, leader: int) -> bool:
         """Return True while the node of an instance is out of the ROS graph on purpose."""
         return any(
-            self._ask(name, "has_departed", partial(launcher.has_departed, leader), False)
+            self._ask(name, "has_departed", launcher, False, bool, leader)
             for name, launcher in self._of(GraphDepartureLauncher)
         )
 
@@ -127,19 +173,19 @@ class Launchers:
         """Return the leader and all processes of the instance that it leads, as far as is known."""
         for name, launcher in self._of(ProcessTreeLauncher):
             if self._leads(name, launcher, leader):
-                return self._ask(name, "members", partial(launcher.members, leader), (leader,))
+                return self._ask(name, "members", launcher, (leader,), Sequence[int], leader)
         return (leader,)
 
     def root(self, leader: int) -> int:
         """Return the pid of the process itself: the leader, if it needs no other program."""
         for name, launcher in self._of(ProcessTreeLauncher):
             if self._leads(name, launcher, leader):
-                return self._ask(name, "root", partial(launcher.root, leader), leader)
+                return self._ask(name, "root", launcher, leader, int, leader)
         return leader
 
     def _leads(self, name: str, launcher: ProcessTreeLauncher, leader: int) -> bool | None:
-        nothing: bool | None = False
-        return self._ask(name, "leads", partial(launcher.leads, leader), nothing)
+        # A launcher that fails may lead the session, so it is asked again.
+        return self._ask(name, "leads", launcher, None, bool | None, leader)
 
     def _of(self, contract: Callable[..., L]) -> Iterator[tuple[str, L]]:
         for name, one in self.made.items():
@@ -147,13 +193,46 @@ class Launchers:
             if implements(launcher, contract):
                 yield name, launcher
 
-    def _ask(self, name: str, method: str, call: Callable[[], T], otherwise: T) -> T:
+    def _ask(
+        self, name: str, method: str, launcher: object, otherwise: T, hint: Any, argument: object
+    ) -> T:
         """Return the answer of a launcher, or another one where the call fails."""
-        try:
-            return call()
-        except FAULTS as fault:
-            reason = f"the launcher {name!r} fails: {method}: {describe_plugin_fault(fault)}"
-            if self._logged.get(name) != reason:
-                self._logged[name] = reason
-                _log.info("%s", reason)
-            return otherwise
+
+        def ask() -> T:
+            answer: Any = getattr(launcher, method)(argument)
+            if hint is Sequence[int] and isinstance(answer, Sequence):
+                if len(answer) > MOST_MEMBERS:
+                    raise PluginError(f"{len(answer)} processes; allowed: {MOST_MEMBERS}")
+                answer = tuple(answer)
+            whole(answer, hint, method)
+            pids = answer if isinstance(answer, tuple) else (answer,) if hint is int else ()
+            wrong = [pid for pid in pids if not 0 < pid <= _HIGHEST_PID]
+            if wrong:
+                raise PluginError(f"{method} has {wrong[0]!r:.30}, which is no pid")
+            return answer  # type: ignore[no-any-return]
+
+        with contextlib.suppress(PluginError):  # the guard has recorded it
+            return self.calls.ask("launcher", name, method, ask, launcher)
+        return otherwise
+
+
+def _checked(launch: Launch, prepared: Launch) -> Launch:
+    """Return the launch with the prepared command line and environment; raise `PluginError`."""
+    given: Any = prepared
+    if not isinstance(given.argv, list | tuple) or not isinstance(given.environment, Mapping):
+        raise PluginError("`argv` has to be a tuple, and `environment` a mapping")
+    argv, environment = tuple(given.argv), dict(given.environment)
+    # The slave's own variables may have bytes that are no UTF-8; the supervisor passes them on.
+    whole([one for one in argv if one not in launch.argv], list[str], "argv")
+    own = launch.environment
+    added = {name: text for name, text in environment.items() if own.get(name) != text}
+    whole(added, Mapping[str, str], "environment")
+    if not argv or not argv[0]:
+        raise PluginError("`argv` is empty; a command line is required")
+    wrong = next((one for one in (*argv, *added, *added.values()) if "\0" in one), None)
+    if wrong is not None:
+        raise PluginError(f"{wrong!r:.100} has a NUL character, which no command line can hold")
+    odd = next((one for one in added if not one or "=" in one), None)
+    if odd is not None:
+        raise PluginError(f"`environment` has the name {odd!r:.100}, which no variable can have")
+    return replace(launch, argv=argv, environment=environment)

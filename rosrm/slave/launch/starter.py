@@ -7,13 +7,14 @@ import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.state import HeldInstance, SlaveState
-from rosrm.errors import LaunchError
+from rosrm.errors import LaunchError, describe_fault
 from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.values import Assignment, InstanceId, InstanceState
 from rosrm.ros.names import STATE_CONFIG, Names
@@ -24,11 +25,13 @@ from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.epoch import EPOCH_NOTE
 from rosrm.slave.launch.command import launch_order
 from rosrm.slave.launch.environment import ProcessLocation, no_key
+from rosrm.slave.launch.lanes import Lanes
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import to_memo
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.supervisor.client_values import LaunchOrder
 from rosrm.supervisor.secret_files import is_exposed
 from rosrm.wording import one_line
 
@@ -47,6 +50,7 @@ class Starter:
     Attributes:
         snapshots: directory of the snapshots.
         state: instances of the slave; read-only here.
+        lanes: threads of the starts that ask a plugin, which may hang.
         take: takes events for the core.
         instance_key: returns the key of an instance; None: with `security: none`.
     """
@@ -61,10 +65,12 @@ class Starter:
     graph: GraphWatch
     sessions: SessionTable
     launchers: Launchers
+    lanes: Lanes
     take: Callable[[events.Event], None]
     instance_key: Callable[[InstanceId], bytes | None] = no_key
     _environment: Mapping[str, str] = field(init=False)
     _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
+    _launching: set[InstanceId] = field(init=False, default_factory=set)
     _closed: bool = field(init=False, default=False)
     _warned_of: set[str] = field(init=False, default_factory=set)
 
@@ -88,7 +94,8 @@ class Starter:
         # Without this report the master would withdraw the assignment.
         waiting = [
             self.state.held[one.instance].status for one in wanted
-            if one not in ready and (one.snapshot_hosts or one.spec.artifacts)
+            if one.instance in self._launching
+            or (one not in ready and (one.snapshot_hosts or one.spec.artifacts))
         ]  # fmt: skip
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
@@ -116,6 +123,7 @@ class Starter:
         if not isinstance(command, commands.Restart):  # a restart needs nothing: the start follows
             self.artifacts.forget(command.instance)
             self.replication.forget(command.instance)
+            self._launching.discard(command.instance)
             refusal = "it was stopped before it was started"
             self.take(events.LaunchRefused(command.instance, refusal))
         return True
@@ -129,7 +137,11 @@ class Starter:
         return instance not in self.state.waiting and not self._is_preparing(instance)
 
     def _is_preparing(self, instance: InstanceId) -> bool:
-        return self.artifacts.is_preparing(instance) or self.replication.is_preparing(instance)
+        return (
+            instance in self._launching
+            or self.artifacts.is_preparing(instance)
+            or self.replication.is_preparing(instance)
+        )
 
     def look_at_graph(self, awaited: Mapping[InstanceId, HeldInstance]) -> None:
         """Report the awaited nodes that are in the ROS graph now."""
@@ -175,16 +187,41 @@ class Starter:
             try:
                 self._check_supervisor(assignment)
                 self._check_secrets(assignment)
-                order = launch_order(
-                    assignment, self._environment, sys.executable, where=where,
+                order = partial(
+                    launch_order, assignment, self._environment, sys.executable, where=where,
                     state_directory=self.supervisor.state, launchers=self.launchers,
-                    last_contact=self.state.last_contact,
                 )  # fmt: skip
-                orders.append(replace(order, memo=to_memo(held.memo), slots=slots))
+                lane = _lane_of(assignment)
+                if lane:
+                    self._launching.add(assignment.instance)
+                    self.lanes.run(lane, order, partial(self._ordered, assignment, slots))
+                else:
+                    orders.append(self._completed(order(), slots))
             except LaunchError as error:
                 self._refuse(assignment.instance, str(error))
         if orders:
             self.supervisor.start(orders)
+
+    def _completed(self, order: LaunchOrder, slots: int) -> LaunchOrder:
+        memo = to_memo(self.state.held[order.instance].memo)
+        return replace(order, memo=memo, slots=slots, last_contact=self.state.last_contact)
+
+    def _ordered(
+        self, assignment: Assignment, slots: int, outcome: LaunchOrder | BaseException
+    ) -> None:
+        """Start an instance whose launcher has answered, or refuse it."""
+        instance = assignment.instance
+        if instance not in self._launching:  # it was stopped
+            return
+        self._launching.discard(instance)
+        if isinstance(outcome, LaunchOrder):
+            if self._is_wanted(assignment):
+                self.supervisor.start([self._completed(outcome, slots)])
+        elif isinstance(outcome, LaunchError):
+            self._refuse(instance, str(outcome))
+        else:
+            reason = f"{instance}: the launcher of {_lane_of(assignment)!r} fails: "
+            self._refuse(instance, reason + describe_fault(outcome))
 
     def _seen_before(self, assignment: Assignment, node: str) -> frozenset[bytes]:
         """Return the endpoints of a node that do not show that the instance is ready.
@@ -222,3 +259,10 @@ class Starter:
             self.snapshots, config.keep.every, config.state / EPOCH_NOTE, self.instance_key,
             self.endpoint.description.devices, self.artifacts.root,
         )  # fmt: skip
+
+
+def _lane_of(assignment: Assignment) -> str:
+    """Return the lane of a start that asks a launcher or a strategy; "": it asks none."""
+    spec = assignment.spec
+    restored = "restored" if assignment.restored else ""
+    return spec.container.engine or spec.migration.strategy or restored

@@ -96,9 +96,19 @@ def test_a_plugin_that_takes_long_to_import_is_named_in_the_log(install, caplog,
 
 
 def test_ctrl_c_during_an_import_is_not_taken_for_a_fault(install):
-    install("vx_stop", "raise KeyboardInterrupt")
+    """The user's Ctrl-C ends a command, also while it imports a plugin."""
+    install(
+        "vx_stop", "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(9)"
+    )
     with pytest.raises(KeyboardInterrupt):
         Registry.discover()
+
+
+def test_a_plugin_that_raises_the_exception_of_ctrl_c_is_broken(install):
+    """Such a plugin ends no command and no part, as one that raises any other exception."""
+    install("vx_stop", "raise KeyboardInterrupt")
+    (broken,) = Registry.discover().broken
+    assert broken.reason.startswith("does not import: KeyboardInterrupt (")
 
 
 def test_what_a_plugin_prints_at_its_import_is_no_output_of_a_command(install, capsys):

@@ -484,7 +484,7 @@ def test_a_host_check_that_is_no_executor_of_the_offer_is_refused():
 
 
 def test_a_host_check_that_cannot_be_read_is_the_plugins_fault():
-    """Report a property that raises and a value that cannot be hashed as a broken plugin."""
+    """Report a property that raises and a value that is no text as a broken plugin."""
 
     class Angry:
         propose = host_fault = max
@@ -494,16 +494,19 @@ def test_a_host_check_that_cannot_be_read_is_the_plugins_fault():
             raise OSError("no")
 
     listed = SimpleNamespace(propose=None, host_check=["m.able"], host_fault=max)
-    for strategy, said in ((Angry(), "OSError: no"), (listed, "TypeError: ")):
+    for strategy, said in (
+        (Angry(), "its `host_check` raised OSError: no"),
+        (listed, r"its `host_check` is \['m.able'\], no executor"),
+    ):
         offer = MigrationOffer("m", lambda options, made=strategy: made)
         registry = registry_of(offer)
-        with pytest.raises(PluginError, match=f"its `host_check` raised {said}"):
+        with pytest.raises(PluginError, match=said):
             registry.migrations({"m": {}})
 
 
 def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
     """A probe fails; for a part that the master needs, the error is raised. Nothing hangs."""
-    monkeypatch.setattr("rosrm.extensions.registry.CREATE_LIMIT", 0.05)
+    monkeypatch.setattr("rosrm.extensions.guard.LOADING_LIMIT", 0.05)
 
     def hangs(*_):
         threading.Event().wait()
@@ -519,7 +522,7 @@ def test_a_create_that_hangs_is_ended_and_named(monkeypatch, context):
 
 def test_a_hook_that_hangs_is_named_while_it_does_and_ended(monkeypatch, caplog):
     """The message has the hook, its place and the line of the hang; the other plugins load."""
-    monkeypatch.setattr("rosrm.extensions.discovery.LOADING_LIMIT", 0.3)
+    monkeypatch.setattr("rosrm.extensions.guard.LOADING_LIMIT", 0.3)
     monkeypatch.setattr("rosrm.extensions.discovery.SLOW_LOADING", 0.1)
 
     @hookimpl

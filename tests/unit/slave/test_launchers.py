@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import Any
 
@@ -132,18 +131,18 @@ def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
     assert (known.has_departed(10), known.has_departed(30)) == (True, False)
 
 
-def test_a_launcher_that_fails_leaves_an_instance_as_any_other(caplog):
-    """The fault of a launcher is logged once."""
-    caplog.set_level(logging.INFO)
+def test_a_launcher_that_fails_leaves_an_instance_as_any_other():
+    """The fault of a launcher is recorded once, with its place."""
     known = launchers(ours=Faulty())
     for _ in range(2):
-        assert known.leads(10) is False
+        assert known.leads(10) is None
         assert known.members(10) == (10,)
         assert known.root(10) == 10
-    (line,) = caplog.messages
-    assert "the launcher 'ours' fails: leads: RuntimeError: out of order" in line
     known.discard_images(InstanceId("p", 7))
     assert not known.has_departed(10)
+    ((plugin, error),) = known.calls.changes(0.0)
+    assert plugin == ("launcher", "ours")
+    assert f"RuntimeError: out of order ({__file__}:" in error
 
 
 # --- of plugins ------------------------------------------------------------------------------

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import logging
 import threading
+from functools import partial
 from typing import Final
 
-from rosrm.errors import describe_plugin_fault
+from rosrm.errors import PluginError
+from rosrm.extensions.guard import guarded
+from rosrm.extensions.plugin_calls import titled
 from rosrm.extensions.sinks import EventSink, NoticesRefused
 from rosrm.wording import counted, duration
 from rosrm_alerts.outbox import Outbox
@@ -65,20 +68,21 @@ class Delivery:
                 _log.warning("sink %s: next attempt in %s", self._name, duration(retry))
                 self._stop.wait(retry)
         try:
-            self._sink.close()
-        except Exception as fault:  # noqa: BLE001 - code of a plugin
-            _log.warning("sink %s: close failed: %s", self._name, describe_plugin_fault(fault))
+            guarded(self._sink.close, whom=titled("sink", self._name), hook="close")
+        except PluginError as fault:
+            _log.warning("sink %s: close failed: %s", self._name, fault)
 
     def _deliver(self) -> bool:
         """Deliver all that waits; return False if an attempt failed."""
         while waiting := self._outbox.waiting(self._name, self._batch):
+            send = partial(self._sink.send, [one.notice for one in waiting])
             try:
-                self._sink.send([one.notice for one in waiting])
+                guarded(send, whom=titled("sink", self._name), hook="send", lets=(NoticesRefused,))
             except NoticesRefused as refusal:
                 many = counted(len(waiting), "notice")
                 _log.error("sink %s: %s dropped: %s", self._name, many, refusal)
-            except Exception as fault:  # noqa: BLE001 - code of a plugin
-                _log.warning("sink %s: %s", self._name, describe_plugin_fault(fault))
+            except PluginError as fault:
+                _log.warning("sink %s: %s", self._name, fault)
                 return False
             self._outbox.delivered(waiting)
         return True

@@ -11,7 +11,7 @@ import pytest
 
 from rosrm.errors import PluginError
 from rosrm.extensions.plugin_calls import PluginCalls
-from rosrm.master.plugin_deadline import Deadlines
+from rosrm.extensions.plugin_deadline import Deadlines
 
 SLOW = ("migration", "slow")
 

@@ -1,0 +1,117 @@
+"""The one way into the code of a plugin: a time-out, any exception, and the state of the process.
+
+`PluginCalls.ask` adds the record of a part. A test finds calls of plugins beside these two.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Final, Protocol, TypeVar
+
+from rosrm.errors import PluginError, describe_plugin_fault
+from rosrm.extensions.plugin_calls import Answers, contained
+from rosrm.extensions.process_state import Interrupts, ProcessState
+from rosrm.extensions.time_limit import limited
+from rosrm.wording import listed
+
+T = TypeVar("T")
+
+#: Time-out of the import of a plugin, of a hook and of `create`; seconds. Below the lease of a
+#: host, because a slave that restarts loads its plugins before it renews the lease.
+LOADING_LIMIT: Final = 8.0
+
+
+class Notes(Protocol):
+    """Notes of the running calls; a part keeps them in a file (`rosrm.runtime.crash_notes`)."""
+
+    def reason(self, whom: str) -> str:
+        """Return why a plugin is left out; "": it is not."""
+
+    def begin(self, whom: str, hook: str) -> int:
+        """Note a call that begins; return its slot, 0 for none."""
+
+    def end(self, slot: int) -> None:
+        """Remove the note of a call."""
+
+    def note_versions(self, versions: Mapping[str, str]) -> None:
+        """Note the distribution of each plugin, by its name as in the notes."""
+
+
+_notes: Notes | None = None
+
+
+def keep_notes(notes: Notes | None) -> None:
+    """Keep these notes of all calls in this process from now on."""
+    global _notes  # noqa: PLW0603 - a process has one
+    _notes = notes
+
+
+def note_versions(versions: Mapping[str, str]) -> None:
+    """Note the distribution of each plugin, by its name as in the notes."""
+    if _notes is not None:
+        _notes.note_versions(versions)
+
+
+_log = logging.getLogger("rosrm.plugins")
+
+
+def guarded(
+    call: Callable[[], T], *, whom: str, hook: str = "", seconds: float = LOADING_LIMIT,
+    late: Callable[[], str] | None = None, of: object = None, lets: Answers = (),
+) -> T:  # fmt: skip
+    """Return the answer of plugin code, which may do anything but end the process.
+
+    Args:
+        call: calls the plugin and checks the answer; raises `PluginError` for an invalid one.
+        whom: the plugin, as "probe 'x'".
+        hook: the called method or function, for messages.
+        seconds: time-out; it holds in the main thread alone, so other threads watch themselves.
+        late: returns the text about a time-out.
+        of: object with the method.
+        lets: as in `contained`.
+
+    Raises:
+        PluginError: the call failed, or the plugin is left out.
+    """
+    text = late or partial("it took longer than {:g} s".format, seconds)
+    inner = partial(contained, call, of=of, hook=hook, lets=lets)
+    try:
+        return limited(seconds, partial(in_process, whom, hook, inner), text)
+    except TimeoutError as fault:
+        raise PluginError(describe_plugin_fault(fault)) from fault
+
+
+def in_process(whom: str, hook: str, call: Callable[[], T]) -> T:
+    """Call a plugin; note whom, and restore what it changed in the process."""
+    left_out = "" if _notes is None else _notes.reason(whom)
+    if left_out:
+        raise PluginError(left_out)
+    slot = 0 if _notes is None else _notes.begin(whom, hook)
+    try:
+        if threading.current_thread() is not threading.main_thread():
+            return _without_interrupt(call)
+        before, interrupts = ProcessState(), Interrupts()
+        try:
+            return call()
+        except KeyboardInterrupt as fault:
+            if interrupts.pressed:
+                raise
+            raise PluginError(describe_plugin_fault(fault)) from fault
+        finally:
+            interrupts.end()
+            changed = before.restore()
+            if changed:
+                _log.warning("%s: %s has changed %s, restored now", whom, hook, listed(changed))
+    finally:
+        if _notes is not None:
+            _notes.end(slot)
+
+
+def _without_interrupt(call: Callable[[], T]) -> T:
+    try:
+        return call()
+    except KeyboardInterrupt as fault:  # the user's reaches the main thread alone
+        raise PluginError(describe_plugin_fault(fault)) from fault

@@ -1,0 +1,272 @@
+"""The one way into the code of plugins: whatever a plugin does costs one call."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.extensions.guard import guarded
+from rosrm.extensions.plugin_calls import PluginCalls, required
+from rosrm.extensions.plugin_deadline import Deadlines
+
+PLUGIN = ("filter", "odd")
+#: Letters of the longest text that any message of rosrm accepts, many times over.
+LONG = "x" * 3_000_000
+
+
+class Unspeakable(Exception):
+    """An error that does not give its text."""
+
+    def __str__(self) -> str:
+        raise KeyboardInterrupt
+
+    __repr__ = __str__
+
+
+class Base(BaseException):
+    """An error that is no `Exception`."""
+
+
+class Odd(str):
+    """A text with methods of its own."""
+
+    __slots__ = ()
+
+    def __getitem__(self, _at: object) -> str:
+        raise Base
+
+    split = encode = isprintable = __getitem__  # type: ignore[assignment]
+
+
+class Speaking(Exception):
+    def __str__(self) -> str:
+        return Odd("a\ud800b\x1b[31m\x00" + LONG)
+
+
+ERRORS: list[BaseException] = [
+    ValueError("no"), Base("no"), SystemExit(3), GeneratorExit(), KeyboardInterrupt(),
+    asyncio.CancelledError(), StopIteration(), MemoryError(), RecursionError(), Unspeakable(),
+    Speaking(), ValueError(LONG), ValueError("\ud800\x1b[2J\n"), PluginError(LONG),
+    TimeoutError("mine"), ConfigError("no"), SkipPlugin("no"), OSError(5, "no"),
+    type("n" * 100_000, (Exception,), {})("long name"),
+]  # fmt: skip
+
+
+def _by_guard(call: Callable[[], Any]) -> Any:
+    return guarded(call, whom="filter 'odd'", hook="mask")
+
+
+def _by_ask(call: Callable[[], Any]) -> Any:
+    calls = PluginCalls(Deadlines(5.0))
+    try:
+        return calls.ask(*PLUGIN, "mask", call)
+    finally:
+        ((plugin, error),) = calls.changes(0.0)
+        assert plugin == PLUGIN
+        assert _is_plain(error)
+
+
+def _by_deadline(call: Callable[[], Any]) -> Any:
+    return PluginCalls(Deadlines(5.0)).ask(*PLUGIN, "mask", call)
+
+
+def _by_thread(call: Callable[[], Any]) -> Any:
+    """Call a plugin in a thread, as a probe, an executor or a sink."""
+    outcome: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            _by_guard(call)
+        except BaseException as fault:  # noqa: BLE001 - raised in the test
+            outcome.append(fault)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join(10.0)
+    raise outcome[0]
+
+
+def _is_plain(text: str) -> bool:
+    return text.isprintable() and len(text) < 5_000 and bool(text.encode())
+
+
+@pytest.mark.parametrize("way", [_by_guard, _by_ask, _by_thread])
+@pytest.mark.parametrize("error", ERRORS, ids=lambda one: type(one).__name__[:20])
+def test_whatever_a_plugin_raises_costs_one_call(error: BaseException, way: Any) -> None:
+    """Each exception becomes a `PluginError` with a printable text of bounded length."""
+
+    def fail() -> None:
+        raise error
+
+    with pytest.raises(PluginError) as caught:
+        way(fail)
+    assert _is_plain(str(caught.value))
+
+
+def test_a_fault_names_file_and_line_of_the_plugin() -> None:
+    """The place is the plugin's own, not that of the guard."""
+
+    def fail() -> None:
+        raise Base("no")
+
+    place = f"{__file__}:{fail.__code__.co_firstlineno + 1}"
+    with pytest.raises(PluginError, match=rf"Base: no \({place}\)"):
+        _by_guard(fail)
+
+
+def test_the_ctrl_c_of_the_user_ends_a_command() -> None:
+    """A `KeyboardInterrupt` by SIGINT is no fault of the plugin that runs at that moment."""
+    with pytest.raises(KeyboardInterrupt):
+        _by_guard(lambda: os.kill(os.getpid(), signal.SIGINT))
+
+
+def test_an_answer_by_contract_is_no_fault_and_bounded() -> None:
+    """An exception that the contract names passes with a bounded text, as its own class."""
+
+    class Absent(SkipPlugin):
+        """A class of the plugin."""
+
+    def skip() -> None:
+        raise Absent("a\ud800" + LONG)
+
+    with pytest.raises(SkipPlugin) as caught:
+        guarded(skip, whom="probe 'odd'", lets=(SkipPlugin,))
+    assert type(caught.value) is SkipPlugin
+    assert _is_plain(str(caught.value))
+
+
+def test_a_text_of_a_plugin_is_bounded_and_printable() -> None:
+    """A reason is cut, and loses what a terminal or a message cannot hold; newlines stay."""
+    assert required("two\nlines", str) == "two\nlines"
+    assert required(Odd("a\x1bb"), str) == "a?b"
+    assert _is_plain(required("\ud800" + LONG, str))
+
+
+def _ignore(*_: object) -> None:
+    """Handle a signal."""
+
+
+def _take_signals() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM):
+        signal.signal(number, _ignore)
+
+
+HARM: dict[str, Callable[[], Any]] = {
+    "signals": _take_signals,
+    "ignored": lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN),
+    "umask": lambda: os.umask(0),
+    "directory": lambda: os.chdir("/"),
+    "disabled log": lambda: logging.disable(logging.CRITICAL),
+    "level of the log": lambda: logging.getLogger().setLevel(logging.CRITICAL),
+    "handlers of the log": logging.getLogger().handlers.clear,
+}
+
+
+def _state() -> tuple[object, ...]:
+    mask = os.umask(0o077)
+    os.umask(mask)
+    root = logging.getLogger()
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    handlers = [signal.getsignal(one) for one in numbers]
+    return (mask, Path.cwd(), root.manager.disable, root.level, root.handlers[:], handlers)
+
+
+@pytest.mark.parametrize("way", [_by_guard, _by_deadline])
+@pytest.mark.parametrize("harm", HARM)
+def test_what_a_plugin_changes_in_the_process_is_restored(
+    harm: str, way: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Signals, log, umask and working directory are as before the call, and a warning says so."""
+    before = _state()
+    way(HARM[harm])
+    assert _state() == before
+    assert "has changed" in caplog.text
+
+
+def _endless() -> None:
+    while True:
+        pass
+
+
+def _endless_without_alarm() -> None:
+    signal.signal(signal.SIGALRM, _ignore)
+    _endless()
+
+
+def _endless_without_timer() -> None:
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    time.sleep(60.0)
+
+
+@pytest.fixture
+def _own_timer() -> Iterator[None]:
+    """Restore the timer of the test runner, which the tested plugins take."""
+    left = signal.setitimer(signal.ITIMER_REAL, 0.0)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, *left)
+
+
+@pytest.mark.usefixtures("_own_timer")
+@pytest.mark.parametrize("hang", [_endless, _endless_without_alarm, _endless_without_timer])
+def test_the_limit_holds_although_a_plugin_takes_its_signal(hang: Callable[[], None]) -> None:
+    """A call ends after its limit, also if the plugin replaces the alarm or stops the timer."""
+    began = time.monotonic()
+    with pytest.raises(PluginError, match="took longer than"):
+        guarded(hang, whom="filter 'odd'", seconds=0.2)
+    assert time.monotonic() - began < 20.0
+
+
+def test_a_plugin_that_is_often_slow_is_not_called_for_a_while() -> None:
+    """Calls that are not late, but hold the loop again and again, begin a pause, too."""
+    calls = PluginCalls(Deadlines(0.3, pause=60.0))
+
+    def slow_calls() -> None:
+        for _ in range(12):
+            calls.ask(*PLUGIN, "mask", lambda: time.sleep(0.2))
+
+    with pytest.raises(PluginError, match="not asked again"):
+        slow_calls()
+
+
+def test_quick_calls_begin_no_pause() -> None:
+    """A policy that decides quickly may decide as often as the master asks."""
+    calls = PluginCalls(Deadlines(0.3, pause=60.0))
+    for _ in range(2_000):
+        assert calls.ask(*PLUGIN, "mask", lambda: 7) == 7
+
+
+def test_calls_leave_nothing_in_memory() -> None:
+    """Thousands of guarded calls, good and bad, leave neither objects nor memory."""
+    left = signal.setitimer(signal.ITIMER_REAL, 0.0)
+    calls = PluginCalls(Deadlines(5.0))
+
+    def both(number: int) -> None:
+        for _ in range(number):
+            calls.ask(*PLUGIN, "mask", int)
+            with pytest.raises(PluginError):
+                calls.ask(*PLUGIN, "mask", lambda: 1 // 0)
+            calls.changes(time.monotonic())
+
+    both(200)
+    gc.collect()
+    objects, memory = len(gc.get_objects()), _memory()
+    both(2_000)
+    gc.collect()
+    signal.setitimer(signal.ITIMER_REAL, *left)
+    assert len(gc.get_objects()) - objects < 500
+    assert _memory() - memory < 4_096
+
+
+def _memory() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4
