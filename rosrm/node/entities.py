@@ -5,16 +5,19 @@ from __future__ import annotations
 import inspect
 from array import array
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Final
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.publisher import Publisher
 from rclpy.qos import HistoryPolicy, ReliabilityPolicy
 
-#: Source time stamps in every mark: those of the newest messages of each input.
-COVERED_KEPT: Final = 256
+from rosrm.node.handoff.buffer import HISTORY
+
+#: Source time stamps in a mark that is not whole: those of the newest messages of each input.
+NEWEST: Final = 256
 #: Bytes assumed for a field without a size of its own.
 _SMALL: Final = 32
 
@@ -48,7 +51,9 @@ class Input:
         with_info: the callback takes the message's information too.
         buffered: messages are stored during a handoff.
         wants_all: every message counts, not only the newest.
+        depth: most messages that the reader keeps; 0: unlimited.
         covered: source time stamps of the newest processed messages, ns.
+        processed: position of the last one.
         subscription: rclpy's object.
     """
 
@@ -56,9 +61,11 @@ class Input:
     with_info: bool
     buffered: bool
     wants_all: bool
+    depth: int = 0
     topic: str = ""
     key: str = ""
-    covered: deque[int] = field(default_factory=lambda: deque(maxlen=COVERED_KEPT))
+    covered: deque[int] = field(default_factory=lambda: deque(maxlen=HISTORY))
+    processed: int = 0
     subscription: Any = None
 
     def is_ordered(self) -> bool:
@@ -71,7 +78,20 @@ class Input:
             self.callback(message, info)
         else:
             self.callback(message)
-        self.covered.append(info["source_timestamp"])
+        self.note([info["source_timestamp"]])
+
+    def note(self, stamps: Sequence[int]) -> None:
+        """Note processed messages by their source time stamps."""
+        self.covered.extend(stamps)
+        self.processed += len(stamps)
+
+    def newest(self, *, whole: bool) -> array[int]:
+        """Return the time stamps for a mark, oldest first."""
+        if whole:
+            return array("q", self.covered)
+        newest_first = array("q", islice(reversed(self.covered), NEWEST))
+        newest_first.reverse()
+        return newest_first
 
 
 def size_of(message: Any) -> int:
@@ -96,6 +116,13 @@ def wants_all(qos: Any) -> bool:
     if qos.reliability is ReliabilityPolicy.BEST_EFFORT:
         return False
     return qos.history is HistoryPolicy.KEEP_ALL or qos.depth > 1
+
+
+def depth_of(qos: Any) -> int:
+    """Return the most messages that a reader keeps; 0: unlimited."""
+    if isinstance(qos, int):
+        return qos
+    return 0 if qos.history is HistoryPolicy.KEEP_ALL else int(qos.depth)
 
 
 def wants_info(callback: Callable[..., Any]) -> bool:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import threading
 import time
-from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
 from typing import Any, Final
@@ -25,12 +24,13 @@ from rosrm.node.entities import (
     PublisherGate,
     ServiceOf,
     TimerOf,
+    depth_of,
     refuse_coroutine,
     size_of,
     wants_all,
     wants_info,
 )
-from rosrm.node.handoff.buffer import InputBuffer, Sent
+from rosrm.node.handoff.buffer import InputBuffer, Known, Sent
 from rosrm.node.handoff.reader_count import ReaderCount
 from rosrm.node.handoff.replay import InputReplay
 from rosrm.node.identity import NodeIdentity
@@ -140,7 +140,7 @@ class NodeEntities:
         if topic in _INTERNAL:
             return self.plain.create_subscription(message_type, topic, callback, qos, **rest)
         refuse_coroutine(callback, topic)
-        one = Input(callback, wants_info(callback), buffer, wants_all(qos))
+        one = Input(callback, wants_info(callback), buffer, wants_all(qos), depth_of(qos))
 
         def take(message: Any, info: Any) -> None:
             self._received(one, message, info)
@@ -235,7 +235,7 @@ class NodeEntities:
             if one.buffered and (self.mode is not Mode.ACTIVE or self.is_replaying):
                 self._keep(one, message, info)
                 if self._may_catch_up(one):
-                    self._catch_up(one)
+                    self._catch_up(one, taken=1)
             elif self.mode is Mode.ACTIVE and not self._is_late(one, info):
                 self._cycle(one.serve, message, info)
 
@@ -267,10 +267,13 @@ class NodeEntities:
     def _is_one_thread(self) -> bool:
         return not isinstance(self.node.executor, MultiThreadedExecutor)
 
-    def _catch_up(self, one: Input) -> None:
+    def _catch_up(self, one: Input, taken: int = 0) -> None:
         """Buffer received messages, because a DDS reader has less room and drops the oldest."""
         for message, info in waiting(one.subscription):
             self._keep(one, message, info)
+            taken += 1
+        if 0 < one.depth <= taken:
+            self.buffer.overran(one.key)
 
     def catch_up(self) -> None:
         """Buffer received messages of all buffered inputs, unless several threads take them."""
@@ -283,6 +286,11 @@ class NodeEntities:
         """Return an input that has lost a message and needs every one; "" if there is none."""
         wanting = (one for one in self.inputs if one.buffered and one.wants_all)
         return next((one.topic for one in wanting if self.buffer.misses_one(one.key)), "")
+
+    def input_known(self, known: Known) -> str:
+        """Return an input of which the buffer has this knowledge; "" if there is none."""
+        buffered = (one for one in self.inputs if one.buffered)
+        return next((one.topic for one in buffered if self.buffer.known(one.key) is known), "")
 
     def serve_what_has_come(self, then: Callable[[], None]) -> None:
         """Serve received messages, which a later shadow does not receive; then call `then`."""
@@ -344,11 +352,17 @@ class NodeEntities:
             what = f"{type(error).__name__}: {error}"
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
-    def covered_inputs(self, publishers: Callable[[Input], int]) -> list[CoveredInput]:
-        """Return the processed messages of each buffered input, for a mark of the state."""
+    def covered_inputs(
+        self, publishers: Callable[[Input], int], *, whole: bool = False
+    ) -> list[CoveredInput]:
+        """Return the processed messages of each buffered input, for a mark of the state.
+
+        A whole mark names all that this node remembers, other ones the newest.
+        """
         return [
             CoveredInput(
-                topic=one.key, publishers=publishers(one), covered=array("q", one.covered)
+                topic=one.key, publishers=publishers(one), processed=one.processed,
+                covered=one.newest(whole=whole),
             )
             for one in self.inputs if one.buffered
         ]  # fmt: skip
@@ -357,15 +371,16 @@ class NodeEntities:
         """Drop messages that a state covers, now or when they arrive."""
         for one in inputs:
             self.buffer.cover(
-                one.topic, one.covered, single=one.publishers <= 1, now=time.monotonic()
-            )
+                one.topic, one.covered, processed=one.processed, single=one.publishers <= 1,
+                now=time.monotonic(),
+            )  # fmt: skip
 
     def inherit(self, inputs: Iterable[CoveredInput]) -> None:
         """Treat messages that the source of the state processed as processed here."""
         own = {one.key: one for one in self.inputs}
         for covered in inputs:
             if covered.topic in own:
-                own[covered.topic].covered.extend(covered.covered)
+                own[covered.topic].note(covered.covered)
 
     def timers_due(self) -> list[int]:
         """Return the nanoseconds until each timer is due, in order of creation; -1: cancelled.

@@ -211,12 +211,14 @@ int node_keep_state(TestNode * node, const char * topic, const char * type, int 
     });
 }
 
-int node_add_input(TestNode * node, const char * topic, int number, int buffered, int wants_all)
+int node_add_input(
+  TestNode * node, const char * topic, int number, int buffered, int wants_all, int depth)
 {
   auto input = std::make_shared<Input>();
   input->topic = topic;
   input->buffered = buffered != 0;
   input->wants_all = wants_all != 0;
+  input->depth = static_cast<std::size_t>(depth);
   input->publishers = [node, number] {
       return static_cast<std::uint32_t>(node->calls.matched(0, number));
     };
@@ -340,14 +342,24 @@ int buffer_add(
 
 void buffer_cover(
   InputBuffer * buffer, const char * input, const std::int64_t * stamps, std::size_t count,
-  int single, double now)
+  std::uint64_t processed, int single, double now)
 {
-  buffer->cover(input, std::vector<std::int64_t>(stamps, stamps + count), single != 0, now);
+  const std::vector<std::int64_t> covered(stamps, stamps + count);
+  buffer->cover(input, covered, processed, single != 0, now);
+}
+
+int buffer_known(InputBuffer * buffer, const char * input)
+{
+  return static_cast<int>(buffer->known(input));
 }
 
 int buffer_overlaps(InputBuffer * buffer, const char * input) {return buffer->overlaps(input);}
 
 int buffer_is_behind(InputBuffer * buffer, const char * input) {return buffer->is_behind(input);}
+
+void buffer_overran(InputBuffer * buffer, const char * input) {buffer->overran(input);}
+
+void buffer_set_last(InputBuffer * buffer) {buffer->is_last = true;}
 
 int buffer_misses_one(InputBuffer * buffer, const char * input)
 {

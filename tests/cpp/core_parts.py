@@ -11,6 +11,8 @@ from typing import Any, Final
 
 from rclpy.serialization import serialize_message
 
+from rosrm.node.handoff.buffer import Known
+from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import CoveredInput, StateMark, StatePart
 from tests.cpp.core_library import loaded
 
@@ -40,12 +42,26 @@ class CppInputBuffer:
             add(self._handle, topic.encode(), _I64(sent.stamp), number, _F64(now), _SIZE(size))
         )
 
-    def cover(self, topic: str, stamps: Iterable[int], *, single: bool, now: float) -> None:
+    def cover(
+        self, topic: str, stamps: Iterable[int], *, processed: int, single: bool, now: float
+    ) -> None:
         values = list(stamps)
         data = (_I64 * len(values))(*values)
         self._core.buffer_cover(
-            self._handle, topic.encode(), data, _SIZE(len(values)), int(single), _F64(now)
-        )
+            self._handle, topic.encode(), data, _SIZE(len(values)), _U64(processed), int(single),
+            _F64(now),
+        )  # fmt: skip
+
+    def known(self, topic: str) -> Known:
+        return list(Known)[self._core.buffer_known(self._handle, topic.encode())]
+
+    def overran(self, topic: str) -> None:
+        self._core.buffer_overran(self._handle, topic.encode())
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name == "is_last":
+            self._core.buffer_set_last(self._handle)
+        super().__setattr__(name, value)
 
     def overlaps(self, topic: str) -> bool:
         return bool(self._core.buffer_overlaps(self._handle, topic.encode()))
@@ -90,7 +106,10 @@ class CppCutAssembler:
             CoveredInput(topic=one.topic, covered=array("q", one.covered)) for one in mark.inputs
         ]
         parts = [StatePart(topic=one.topic, size=one.size, digest=one.digest) for one in mark.parts]
-        data = serialize_message(StateMark(sequence=mark.sequence, parts=parts, inputs=inputs))
+        message = StateMark(
+            protocol_version=PROTOCOL_VERSION, sequence=mark.sequence, parts=parts, inputs=inputs
+        )
+        data = serialize_message(message)
         return bool(self._core.cuts_add_mark(self._handle, data, _SIZE(len(data)), _F64(now)))
 
     def take(self) -> Any:

@@ -471,7 +471,7 @@ class Node(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
         qos = subscription.qos_profile
         wants_all = qos.reliability is not ReliabilityPolicy.BEST_EFFORT and qos.depth > 1
         topic_name = subscription.topic_name.encode()
-        core.call("node_add_input", topic_name, number, int(buffer), int(wants_all))
+        core.call("node_add_input", topic_name, number, int(buffer), int(wants_all), qos.depth)
         return subscription
 
     def create_timer(self, timer_period_sec: float, callback: Any, *rest: Any, **named: Any) -> Any:

@@ -126,6 +126,34 @@ def test_a_shadow_that_is_slower_than_its_source_keeps_up(stage, counter):
     assert R.FAILED not in conductor.of(2)
 
 
+@pytest.mark.parametrize("phase", [R.SHADOWING, R.READY], ids=["before", "after"])
+def test_a_shadow_that_stalls_learns_which_inputs_the_missed_marks_covered(stage, counter, phase):
+    """A restore of a large state takes longer than its reader can store the marks.
+
+    The input has two publishers, so the newest covered message says nothing of the earlier ones.
+    """
+    busy = Stage(beside=stage)
+    counts, sums = stage.listen(Int64, "count"), stage.listen(Int64, "sum")
+    first = stage.instance(counter, 1)
+    second = busy.instance(counter, 2, alias=ALIAS, shadow=True)
+    talkers = [stage.plain.create_publisher(Int64, "add", RELIABLE) for _ in range(2)]
+    conductor = Conductor(stage, source=1, destination=2)
+    conductor.say(C.SHADOW)
+    conductor.wait(1, R.ATTACHED)
+    conductor.wait(2, phase)
+    total = 700
+    for number in range(total):
+        talkers[number % 2].publish(Int64(data=1))
+        while first.total < number:  # the shadow is not executed
+            stage.executor.spin_once(timeout_sec=PATIENCE)
+    conductor.hand_over()
+    goes_on(stage, counts)
+    stage.spin_until(lambda: numbers(sums)[-1:] == [total], "the last sum")
+    goes_on(stage, counts)
+    assert second.total == total
+    assert numbers(sums) == list(range(1, total + 1))
+
+
 def test_a_shadow_is_not_heard_before_it_is_active(stage, pair):
     """A shadow has no output, state, timer or service; with the same name it would be doubled."""
     pair.conductor.prepare()

@@ -15,10 +15,12 @@ from std_srvs.srv import Trigger
 
 from rosrm.node import Node
 from rosrm.node.managed_node import Mode
+from rosrm.node.snapshots.marks import POSITIONS
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, encoded_head
 from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateMark
+from tests.old_marks import old_mark
 from tests.ros.nodes import ALIAS, RELIABLE, Conductor, Counter, Counting
 
 LATCHED = QoSProfile(
@@ -176,14 +178,16 @@ def rewrite(directory, **changes) -> None:
     changed = deserialize_message(mark, StateMark)
     for name, value in changes.items():
         setattr(changed, name, value)
-    contents = [bytes(serialize_message(changed)), *parts]
+    is_old = changed.protocol_version < POSITIONS
+    written = old_mark(changed) if is_old else bytes(serialize_message(changed))
+    contents = [written, *parts]
     blocks = [Block(data, zlib.crc32(data)) for data in contents]
     header = encoded_head(head.process, head.instance, head.sequence + 1, blocks)
     newest.write_bytes(header + b"".join(contents))
 
 
 def test_a_snapshot_of_an_earlier_release_is_restored(stage, tmp_path, counter):
-    """Release 0.1.0 spoke protocol 5, and its snapshots have the same content."""
+    """Release 0.1.0 spoke protocol 5, and its marks had no positions and other digests."""
     first = stage.instance(counter, 1, keep=tmp_path)
     stage.spin_until(lambda: first.count >= 10, "ten counts")
     stage.remove(first)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 from rclpy.qos import QoSProfile
 
 from rosrm.node.handoff import channel as topics
+from rosrm.node.handoff.buffer import HISTORY, Known
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.snapshot_assembler import Cut, CutAssembler
 from rosrm.node.handoff.state_parts import (
@@ -45,6 +46,8 @@ _QUIET: Final = 0.2
 _MATCHED: Final = 1.5
 #: Seconds between two checks of the conditions that a shadow waits for.
 _REVIEW: Final = 0.1
+#: Seconds between two requests for a whole mark.
+_ASKED: Final = 0.5
 #: Most bytes of a message on the source's topics: a part of the state, sealed.
 _LARGEST_MESSAGE: Final = LARGEST_PART + 1024
 
@@ -71,6 +74,7 @@ class Destination:
         self._alone = False
         self._active = False
         self._last_report = 0.0
+        self._asked_at = -inf
         self._matched_at = inf
         self._was_ready = False
         self._may_switch = False
@@ -231,6 +235,8 @@ class Destination:
                 self._entities.catch_up()  # messages that wait in a reader have arrived, too
             if not self._ended:
                 self._review()
+            if not self._ended and self._cut is not None:
+                self._ask_for_history()
 
     def _go_on(self) -> None:
         """Restore the newest state, if there is a new one, then check the next step."""
@@ -251,7 +257,27 @@ class Destination:
         self._cut = cut
         for mark in (*cut.passed, cut.mark):
             self._entities.cover(mark.inputs)
-        return True
+        return not self._has_lost_history()
+
+    def _has_lost_history(self) -> bool:
+        """Fail if nobody knows which messages of an input the source has processed."""
+        topic = self._entities.input_known(Known.LOST)
+        if topic:
+            self._end(
+                HandoffReport.FAILED,
+                f"more than {HISTORY} messages came on {topic}, which has several publishers, "
+                f"while no mark of the source came: which of them it has processed is not known",
+            )
+        return bool(topic)
+
+    def _ask_for_history(self) -> None:
+        """Repeat the last report if marks are missing: the source answers with a whole one."""
+        now = time.monotonic()
+        if self._channel is None or now - self._asked_at < _ASKED:
+            return
+        if self._entities.input_known(Known.GAP):
+            self._asked_at = now
+            self._channel.repeat()
 
     def _review(self) -> None:
         """Report progress, request silence when allowed, and become active after it."""
@@ -272,6 +298,7 @@ class Destination:
         if self._cut is not None and self._is_last(self._cut):
             self._activate_if_complete()
         else:
+            self._entities.buffer.is_last = True
             self._channel.report(HandoffReport.SWITCHING, self._sequence())
 
     def _is_last(self, cut: Cut) -> bool:
@@ -302,6 +329,9 @@ class Destination:
         lossy = self._entities.input_with_gap()
         if lossy:
             return f"until the state covers a message on {lossy} that did not come here"
+        unknown = self._entities.input_known(Known.GAP)
+        if unknown:
+            return f"for marks that it missed: what has the source processed on {unknown}?"
         return ""
 
     def _missing_peers(self, mark: StateMark) -> str:
@@ -353,8 +383,19 @@ class Destination:
             return
         if self._cut is None:
             self._end(HandoffReport.FAILED, "the source ended before a state of it was here")
-        else:
+        elif not self._is_unsure():
             self._activate()
+
+    def _is_unsure(self) -> bool:
+        """Fail if marks are missing that may cover a message in the buffer."""
+        topic = self._entities.input_known(Known.GAP)
+        if topic:
+            self._end(
+                HandoffReport.FAILED,
+                f"marks of the source are missing, so which messages on {topic} it has processed "
+                f"is not known",
+            )
+        return bool(topic)
 
     def _activate_if_complete(self) -> None:
         self._entities.catch_up()
@@ -365,7 +406,7 @@ class Destination:
                 f"a message on {lossy} did not come here, and the source has not processed it: "
                 f"its subscription needs a greater depth, or this host is too busy",
             )
-        elif not self._ended:
+        elif not self._ended and not self._is_unsure():
             self._activate()
 
     def _activate(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -10,6 +9,8 @@ from typing import Any, Final, NamedTuple
 #: Newest stored parts of one topic that no mark names yet, and most bytes of its stored parts.
 _KEPT: Final = 16
 _MOST_BYTES: Final = 1 << 30
+#: Bytes of a digest: two contents with the same one do not occur.
+_DIGEST_BYTES: Final = 16
 #: Most marks, and most entries of their lists, that wait for parts of their states.
 _MOST_MARKS: Final = 20_000
 _MOST_ENTRIES: Final = 50_000_000
@@ -20,16 +21,19 @@ class PartKey(NamedTuple):
 
     Attributes:
         size: bytes.
-        digest: CRC-32.
+        digest: BLAKE2b in hexadecimal digits. (A CRC would not do: a content that ends with its own
+            CRC, as those of many formats do, has always the same one.)
     """
 
     size: int
-    digest: int
+    digest: str
 
 
 def part_key(data: bytes) -> PartKey:
     """Return the key by which a mark names a part."""
-    return PartKey(len(data), zlib.crc32(data))
+    from rosrm.keys.hashing import digest_of  # noqa: PLC0415 - 0.8 MiB, which few nodes need
+
+    return PartKey(len(data), digest_of(data, _DIGEST_BYTES, b"").hex())
 
 
 @dataclass(frozen=True, slots=True)

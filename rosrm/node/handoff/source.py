@@ -89,7 +89,7 @@ class HandoffSource:
         if not self._entities.is_replaying:  # a replay counts its messages between two cycles
             self._finish()
 
-    def _show(self, *, last: bool = False) -> bool:
+    def _show(self, *, whole: bool = False, last: bool = False) -> bool:
         """Publish the state between two cycles, and the mark that lists the covered inputs.
 
         Return False on a failure, which has been reported to the master.
@@ -101,8 +101,16 @@ class HandoffSource:
             self._failed(str(error))
             return False
         if self._marks is not None:
-            self._marks.publish(self._mark(last=last))
+            self._marks.publish(self._mark(whole=whole, last=last))
         return True
+
+    def _show_history(self) -> None:
+        """Publish a whole mark of the newest published state, for a follower that missed marks."""
+        ready = self._attached and not self._fault and self._entities.mode is Mode.ACTIVE
+        if ready and self._marks is not None and not self._entities.in_cycle:
+            for part in self._parts:
+                part.show()
+            self._marks.publish(self._mark(whole=True, last=False))
 
     def _failed(self, fault: str) -> None:
         """Report that the state cannot be published; the handoff fails, the node stays active."""
@@ -112,13 +120,15 @@ class HandoffSource:
         if self._channel is not None:
             self._channel.report(HandoffReport.FAILED, self._entities.sequence, fault)
 
-    def _mark(self, *, last: bool) -> StateMark:
+    def _mark(self, *, whole: bool, last: bool) -> StateMark:
         entities = self._entities
         due = self._still_due() if last else entities.timers_due()
         return StateMark(
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence, last=last,
             parts=[part.described() for part in self._parts],
-            inputs=entities.covered_inputs(lambda one: one.subscription.get_publisher_count()),
+            inputs=entities.covered_inputs(
+                lambda one: one.subscription.get_publisher_count(), whole=whole
+            ),
             outputs=[
                 MatchedOutput(topic=one.topic_name, subscriptions=entities.readers.of(one))
                 for one in entities.outputs
@@ -170,7 +180,8 @@ class HandoffSource:
 
     def _take_report(self, report: HandoffReport) -> None:
         with self._entities.turn:
-            if report.phase == HandoffReport.SHADOWING:
+            if report.phase in (HandoffReport.SHADOWING, HandoffReport.READY):
+                self._show_history()
                 self._attach()
             elif report.phase == HandoffReport.SWITCHING:
                 self._asked = True
@@ -199,7 +210,7 @@ class HandoffSource:
         if self._entities.mode is not Mode.ACTIVE:
             return
         self._attached = True
-        if self._show():
+        if self._show(whole=True):
             self._channel.report(HandoffReport.ATTACHED, self._entities.sequence)
 
     def _switch(self) -> None:
@@ -229,7 +240,7 @@ class HandoffSource:
             return  # the handoff was aborted
         self._timers_due = entities.fall_silent()
         self._silent_since = time.monotonic()
-        if not self._show(last=True):
+        if not self._show(whole=True, last=True):
             self._reactivate(lambda: None)  # the failure has been reported
             return
         self._stranded = StrandedSource(entities, self._channel)

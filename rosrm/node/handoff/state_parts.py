@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable
 from typing import Any, Final, NamedTuple
 
@@ -37,7 +38,7 @@ class StateTopic:
         self._restore = restore
         self._key: PartKey | None = None
         self._data: bytes | None = None
-        self._published: PartKey | None = None
+        self._published: bytes | None = None
         self._restored: PartKey | None = None
         self._refused = ""
         self._publish: Callable[[bytes], None] = lambda _: None
@@ -47,29 +48,32 @@ class StateTopic:
         self._publish, self._published = publish, None
 
     def publish(self) -> None:
-        """Publish the part, if it has changed.
+        """Save the part and publish it, if it has changed; raises the errors of `refresh`."""
+        self.refresh()
+        self.show()
+
+    def show(self) -> None:
+        """Publish the saved part, if its successor does not have it."""
+        if self._data is not None and self._data is not self._published:
+            self._publish(self._data)
+            self._published = self._data
+
+    def refresh(self) -> None:
+        """Save the part, if it has changed.
 
         Raises:
             StateError: the part cannot be saved, or is too large.
         """
-        self.refresh()
-        if self._data is not None and self._key != self._published:
-            self._publish(self._data)
-            self._published = self._key
-
-    def refresh(self) -> None:
-        """Save the part, if it has changed; raises the errors of `publish`."""
         try:
             data = self._saved()
         except StateError as error:
-            self._key = self._data = None  # a later "unchanged" would refer to a state never saved
+            self._data = None  # a later "unchanged" would refer to a state never saved
             self._refused = self._refused or str(error)
             raise
         if data is not None:
             self._refused = ""
-            key = part_key(data)
-            if key != self._key:
-                self._key, self._data = key, data
+            if data != self._data:
+                self._data, self._key = data, None
 
     def _saved(self) -> bytes | None:
         """Return the current state, serialised; None: unchanged since the last time."""
@@ -91,7 +95,7 @@ class StateTopic:
         return data
 
     def _check(self, message: Any) -> None:
-        if message is None and self._key is None:
+        if message is None and self._data is None:
             if self._refused:
                 raise StateError(self._refused)  # the state is still the refused one
             raise StateError(
@@ -104,13 +108,15 @@ class StateTopic:
 
     def block(self) -> Block:
         """Return the part's block of a snapshot; the part must be refreshed."""
-        if self._data is None or self._key is None:
+        if self._data is None:
             raise StateError(f"the state on {self.topic} was not saved")
-        return Block(self._data, self._key.digest)
+        return Block(self._data, zlib.crc32(self._data))
 
     def described(self) -> StatePart:
         """Return the part's entry in a mark; the part must have been saved."""
-        size, digest = self._key or (0, 0)
+        if self._key is None and self._data is not None:
+            self._key = part_key(self._data)
+        size, digest = self._key or (0, "")
         return StatePart(topic=self.topic, type=self.type_name, size=size, digest=digest)
 
     def restore_changed(self, data: bytes) -> None:

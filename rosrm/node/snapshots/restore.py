@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from rclpy.serialization import deserialize_message
-
 from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part, size_fault
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
+from rosrm.node.snapshots.marks import decoded_mark
 from rosrm.node.steady_timer import steady_timer
 from rosrm.snapshots.format import Listing
 from rosrm.snapshots.reader import newest
@@ -21,7 +20,7 @@ from rosrm_msgs.msg import StateMark
 #: Seconds for the author's constructor to name all parts, if it spins first; check interval.
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
-#: Oldest protocol version whose snapshots have the same content.
+#: Oldest protocol version whose snapshots can be read.
 _OLDEST_READ: Final = 5
 _REMEDY: Final = (
     "The node does not start, so that the snapshot is not overwritten. To start without it, cancel "
@@ -81,7 +80,7 @@ class SnapshotRestore:
 
     def _restored(self) -> StateMark:
         try:
-            mark = deserialize_message(self._snapshot.blocks[0], StateMark)
+            mark = decoded_mark(self._snapshot.blocks[0])
         except Exception as error:
             raise StateError(f"its mark cannot be read: {error}") from error
         fault = self._fault_of(mark)

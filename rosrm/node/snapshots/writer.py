@@ -22,7 +22,7 @@ from rosrm.node.steady_timer import steady_timer
 from rosrm.snapshots.format import LARGEST, Block
 from rosrm.snapshots.writer import SlotWriter
 from rosrm.version import PROTOCOL_VERSION
-from rosrm_msgs.msg import StateMark
+from rosrm_msgs.msg import StateMark, StatePart
 
 #: Share of a node's time for saving its state; `keep_every` may require a larger one.
 _SHARE: Final = 0.02
@@ -103,19 +103,26 @@ class SnapshotSaver:
     def _blocks(self) -> list[Block]:
         for part in self._parts:
             part.refresh()
-        mark = bytes(serialize_message(self._mark()))
-        blocks = [Block(mark, zlib.crc32(mark)), *(part.block() for part in self._parts)]
+        states = [part.block() for part in self._parts]
+        sizes = [len(state.data) for state in states]
+        mark = bytes(serialize_message(self._mark(sizes)))
+        blocks = [Block(mark, zlib.crc32(mark)), *states]
         size = sum(len(block.data) for block in blocks)
         if size > LARGEST - (1 << 20):
             raise StateError(f"it has {size} bytes; the maximum is {LARGEST}")
         return blocks
 
-    def _mark(self) -> StateMark:
+    def _mark(self, sizes: list[int]) -> StateMark:
         entities = self._entities
+        # No digests: the file has checksums, and hashing takes time in each cycle.
+        parts = [
+            StatePart(topic=part.topic, type=part.type_name, size=size)
+            for part, size in zip(self._parts, sizes, strict=True)
+        ]
         return StateMark(
             protocol_version=PROTOCOL_VERSION, run=self._run, sequence=entities.sequence,
             last=False,
-            parts=[part.described() for part in self._parts],
+            parts=parts,
             inputs=entities.covered_inputs(self._publishers_of),
             timers_due=array("q", self._timers_due()),
         )  # fmt: skip

@@ -282,6 +282,7 @@ typename rclcpp::Subscription<MessageT>::SharedPtr Node::create_subscription(
   input->topic = plain->get_topic_name();
   input->buffered = buffer;
   input->wants_all = wants_all(qos);
+  input->depth = qos.history() == rclcpp::HistoryPolicy::KeepLast ? qos.depth() : 0;
   input->publishers = [reader] {
       const auto subscription = reader.lock();
       return subscription ? static_cast<std::uint32_t>(subscription->get_publisher_count()) : 0u;

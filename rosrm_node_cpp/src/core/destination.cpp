@@ -23,6 +23,8 @@ constexpr double kQuiet = 0.2;
 constexpr double kMatched = 1.5;
 /// Seconds between two checks of the conditions that a shadow waits for.
 constexpr double kReview = 0.1;
+/// Seconds between two requests for a whole mark.
+constexpr double kAsked = 0.5;
 /// Most bytes of a message on the source's topics: a part of the state, sealed.
 constexpr std::size_t kLargestMessage = kLargestPart + 1024;
 
@@ -226,6 +228,9 @@ void Destination::look()
     entities_.catch_up();  // messages that wait in a reader have arrived, too
   }
   review();
+  if (!ended_ && cut_) {
+    ask_for_history();
+  }
 }
 
 /// Restore the newest state, if there is a new one, then check the next step.
@@ -257,7 +262,44 @@ bool Destination::restore(Cut cut)
   }
   entities_.cover(cut.mark.inputs);
   cut_ = std::move(cut);
-  return true;
+  return !has_lost_history();
+}
+
+/// Fail if nobody knows which messages of an input the source has processed.
+bool Destination::has_lost_history()
+{
+  const std::string topic = entities_.input_known(Known::kLost);
+  if (!topic.empty()) {
+    end(
+      Phase::kFailed,
+      "more than " + std::to_string(kHistory) + " messages came on " + topic + ", which has "
+      "several publishers, while no mark of the source came: which of them it has processed is "
+      "not known");
+  }
+  return !topic.empty();
+}
+
+/// Repeat the last report if marks are missing: the source answers with a whole one.
+void Destination::ask_for_history()
+{
+  const double now = entities_.middleware.now();
+  if (channel_ && now - asked_at_ >= kAsked && !entities_.input_known(Known::kGap).empty()) {
+    asked_at_ = now;
+    channel_->repeat();
+  }
+}
+
+/// Fail if marks are missing that may cover a message in the buffer.
+bool Destination::is_unsure()
+{
+  const std::string topic = entities_.input_known(Known::kGap);
+  if (!topic.empty()) {
+    end(
+      Phase::kFailed,
+      "marks of the source are missing, so which messages on " + topic + " it has processed is "
+      "not known");
+  }
+  return !topic.empty();
 }
 
 /// Report progress, request silence when allowed, and become active after it.
@@ -285,6 +327,7 @@ void Destination::review()
   if (is_last()) {
     activate_if_complete();
   } else {
+    entities_.buffer.is_last = true;
     channel_->report(Phase::kSwitching, sequence());
   }
 }
@@ -326,8 +369,12 @@ std::string Destination::still_missing()
     }
   }
   const std::string lossy = entities_.input_with_gap();
-  return lossy.empty() ? "" :
-         "until the state covers a message on " + lossy + " that did not come here";
+  if (!lossy.empty()) {
+    return "until the state covers a message on " + lossy + " that did not come here";
+  }
+  const std::string unknown = entities_.input_known(Known::kGap);
+  return unknown.empty() ? "" :
+         "for marks that it missed: what has the source processed on " + unknown + "?";
 }
 
 /// Return the topic and number of peers matched with the source but not with this node.
@@ -398,7 +445,7 @@ void Destination::take_over_when_quiet()
   }
   if (!cut_) {
     end(Phase::kFailed, "the source ended before a state of it was here");
-  } else {
+  } else if (!is_unsure()) {
     activate();
   }
 }
@@ -412,7 +459,7 @@ void Destination::activate_if_complete()
       Phase::kFailed,
       "a message on " + lossy + " did not come here, and the source has not processed it: its "
       "subscription needs a greater depth, or this host is too busy");
-  } else if (!ended_) {
+  } else if (!ended_ && !is_unsure()) {
     activate();
   }
 }

@@ -85,7 +85,7 @@ void HandoffSource::after_cycle()
 
 /// Publish the state between two cycles, and its mark. Return false on a failure, which has been
 /// reported to the master.
-bool HandoffSource::show(bool last)
+bool HandoffSource::show(bool is_whole, bool last)
 {
   try {
     for (const auto & part : parts_) {
@@ -96,9 +96,22 @@ bool HandoffSource::show(bool last)
     return false;
   }
   if (marks_) {
-    marks_->publish(encoded(mark(last)));
+    marks_->publish(encoded(mark(is_whole, last)));
   }
   return true;
+}
+
+/// Publish a whole mark of the newest published state, for a follower that missed marks.
+void HandoffSource::show_history()
+{
+  const bool is_ready = attached_ && fault_.empty() && entities_.mode == Mode::kActive;
+  if (!is_ready || !marks_ || entities_.in_cycle) {
+    return;
+  }
+  for (const auto & part : parts_) {
+    part->show();
+  }
+  marks_->publish(encoded(mark(true, false)));
 }
 
 /// Report that the state cannot be published; the handoff fails, the node stays active.
@@ -111,7 +124,7 @@ void HandoffSource::failed(const std::string & fault)
   report(Phase::kFailed, fault);
 }
 
-StateMark HandoffSource::mark(bool last)
+StateMark HandoffSource::mark(bool is_whole, bool last)
 {
   StateMark mark;
   mark.run = run_;
@@ -120,7 +133,7 @@ StateMark HandoffSource::mark(bool last)
   for (const auto & part : parts_) {
     mark.parts.push_back(part->described());
   }
-  mark.inputs = entities_.covered_inputs();
+  mark.inputs = entities_.covered_inputs(is_whole);
   for (const auto & output : entities_.outputs) {
     mark.outputs.push_back({output->topic, output->subscriptions()});
   }
@@ -193,7 +206,8 @@ void HandoffSource::open(const StateConfig & config)
 
 void HandoffSource::take_report(const HandoffReport & report)
 {
-  if (report.phase == Phase::kShadowing) {
+  if (report.phase == Phase::kShadowing || report.phase == Phase::kReady) {
+    show_history();
     attach();
   } else if (report.phase == Phase::kSwitching) {
     asked_ = true;
@@ -225,7 +239,7 @@ void HandoffSource::attach()
     return;
   }
   attached_ = true;
-  if (show()) {
+  if (show(true)) {
     report(Phase::kAttached);
   }
 }
@@ -257,7 +271,7 @@ void HandoffSource::fall_silent()
   }
   timers_due_ = entities_.fall_silent();
   silent_since_ = entities_.middleware.now();
-  if (!show(true)) {
+  if (!show(true, true)) {
     reactivate([] {});  // the failure has been reported
     return;
   }

@@ -10,6 +10,8 @@ namespace
 
 /// Longest principal: a ticket, which contains two names.
 constexpr std::size_t kMostLetters = 512;
+/// First protocol version with BLAKE2b digests of parts, and with positions of covered messages.
+constexpr std::uint16_t kPositions = 8;
 
 }  // namespace
 
@@ -90,12 +92,13 @@ Bytes encoded(const StateMark & mark)
       out.text(part.topic);
       out.text(part.type);
       out.number(part.size);
-      out.number(part.digest);
+      out.text(part.digest);
     });
   out.list(
     mark.inputs, [&](const CoveredInput & input) {
       out.text(input.topic);
       out.number(input.publishers);
+      out.number(input.processed);
       out.list(input.covered, time);
     });
   out.list(
@@ -113,16 +116,21 @@ StateMark decoded_mark(const Bytes & data)
   const auto time = [&in] {return in.number<std::int64_t>();};
   StateMark mark;
   mark.protocol_version = in.number<std::uint16_t>();
+  const bool is_old = mark.protocol_version < kPositions;
   mark.run = in.number<std::uint64_t>();
   mark.sequence = in.number<std::uint64_t>();
   mark.last = in.boolean();
   mark.parts = in.list<StatePart>(
-    [&in] {
+    [&in, is_old] {
       StatePart part;
       part.topic = in.text();
       part.type = in.text();
       part.size = in.number<std::uint64_t>();
-      part.digest = in.number<std::uint32_t>();
+      if (is_old) {
+        in.number<std::uint32_t>();  // a CRC-32
+      } else {
+        part.digest = in.text();
+      }
       return part;
     });
   mark.inputs = in.list<CoveredInput>(
@@ -130,7 +138,9 @@ StateMark decoded_mark(const Bytes & data)
       CoveredInput input;
       input.topic = in.text();
       input.publishers = in.number<std::uint32_t>();
+      input.processed = is_old ? 0 : in.number<std::uint64_t>();
       input.covered = in.list<std::int64_t>(time);
+      input.processed = is_old ? input.covered.size() : input.processed;
       return input;
     });
   mark.outputs = in.list<MatchedOutput>(

@@ -10,8 +10,8 @@ namespace rosrm_node
 namespace
 {
 
-/// Source time stamps in every mark: those of the newest messages of each input.
-constexpr std::size_t kCoveredKept = 256;
+/// Source time stamps in a mark that is not whole: those of the newest messages of each input.
+constexpr std::size_t kNewest = 256;
 /// Most messages of one input, and most bytes of all inputs, that are buffered.
 constexpr std::size_t kBufferLimit = 100'000;
 constexpr std::size_t kBufferBytes = std::size_t{512} << 20;
@@ -20,15 +20,16 @@ constexpr double kLate = 10.0;
 /// Seconds of one slice of the replay; a callback that has begun is finished.
 constexpr double kSlice = 0.02;
 
-void remember(Input & input, std::int64_t stamp)
+}  // namespace
+
+void Input::note(std::int64_t stamp)
 {
-  input.covered.push_back(stamp);
-  if (input.covered.size() > kCoveredKept) {
-    input.covered.pop_front();
+  ++processed;
+  covered.push_back(stamp);
+  if (covered.size() > kHistory) {
+    covered.pop_front();
   }
 }
-
-}  // namespace
 
 NodeEntities::NodeEntities(Middleware & ros, NodeIdentity own, bool resting)
 : middleware(ros), identity(std::move(own)), alarms(ros),
@@ -105,13 +106,13 @@ void NodeEntities::received(Input & input, Arrival arrival)
     keep(input, std::move(arrival));
     const bool is_busy = mode == Mode::kActive && middleware.now() >= late_until_;
     if (!is_busy) {
-      input.take_waiting();
+      take_waiting(input, 1);
     }
   } else if (mode == Mode::kActive && !is_late(input, arrival.sent)) {
     cycle(
       [&] {
         arrival.serve();
-        remember(input, arrival.sent.stamp);
+        input.note(arrival.sent.stamp);
       });
   }
 }
@@ -135,7 +136,7 @@ void NodeEntities::keep(Input & input, Arrival arrival)
   const Sent sent = arrival.sent;
   auto serve = [&input, stamp = sent.stamp, call = std::move(arrival.serve)] {
       call();
-      remember(input, stamp);
+      input.note(stamp);
     };
   if (!buffer.add(input.key, sent, std::move(serve), middleware.now(), arrival.size())) {
     on_overflow(input.topic);
@@ -146,8 +147,18 @@ void NodeEntities::catch_up()
 {
   for (const auto & input : inputs) {
     if (input->buffered) {
-      input->take_waiting();
+      take_waiting(*input);
     }
+  }
+}
+
+void NodeEntities::take_waiting(Input & input, std::size_t taken)
+{
+  const std::size_t before = buffer.received(input.key);
+  input.take_waiting();
+  taken += buffer.received(input.key) - before;
+  if (input.depth > 0 && taken >= input.depth) {
+    buffer.overran(input.key);
   }
 }
 
@@ -155,6 +166,16 @@ std::string NodeEntities::input_with_gap()
 {
   for (const auto & input : inputs) {
     if (input->buffered && input->wants_all && buffer.misses_one(input->key)) {
+      return input->topic;
+    }
+  }
+  return "";
+}
+
+std::string NodeEntities::input_known(Known known)
+{
+  for (const auto & input : inputs) {
+    if (input->buffered && buffer.known(input->key) == known) {
       return input->topic;
     }
   }
@@ -298,13 +319,16 @@ void NodeEntities::close(Opening & opening)
   }
 }
 
-std::vector<CoveredInput> NodeEntities::covered_inputs() const
+std::vector<CoveredInput> NodeEntities::covered_inputs(bool is_whole) const
 {
   std::vector<CoveredInput> covered;
   for (const auto & input : inputs) {
     if (input->buffered) {
+      const auto & stamps = input->covered;
+      const std::size_t count = is_whole ? stamps.size() : std::min(kNewest, stamps.size());
+      const auto first = stamps.end() - static_cast<std::ptrdiff_t>(count);
       covered.push_back(
-        {input->key, input->publishers(), {input->covered.begin(), input->covered.end()}});
+        {input->key, input->publishers(), input->processed, {first, stamps.end()}});
     }
   }
   return covered;
@@ -313,7 +337,8 @@ std::vector<CoveredInput> NodeEntities::covered_inputs() const
 void NodeEntities::cover(const std::vector<CoveredInput> & covered)
 {
   for (const auto & one : covered) {
-    buffer.cover(one.topic, one.covered, one.publishers <= 1, middleware.now());
+    buffer.cover(
+      one.topic, one.covered, one.processed, one.publishers <= 1, middleware.now());
   }
 }
 
@@ -323,7 +348,7 @@ void NodeEntities::inherit(const std::vector<CoveredInput> & covered)
     for (const auto & input : inputs) {
       if (input->key == one.topic) {
         for (const auto stamp : one.covered) {
-          remember(*input, stamp);
+          input->note(stamp);
         }
       }
     }

@@ -1,12 +1,19 @@
 #include "rosrm_node_cpp/core/snapshot_assembler.hpp"
 
+#include <sodium.h>
+
 #include <algorithm>
+#include <array>
+#include <stdexcept>
 
 namespace rosrm_node
 {
 
 namespace
 {
+
+/// Bytes of a digest: two contents with the same one do not occur.
+constexpr std::size_t kDigestBytes = 16;
 
 PartKey key_in(const StatePart & part)
 {
@@ -35,7 +42,18 @@ bool names(const StateMark & mark, const std::string & topic, const PartKey & ke
 
 PartKey part_key(const Bytes & data)
 {
-  return {data.size(), crc32(data)};
+  std::array<unsigned char, kDigestBytes> digest;
+  if (crypto_generichash_blake2b_salt_personal(
+      digest.data(), digest.size(), data.data(), data.size(), nullptr, 0, nullptr, nullptr) != 0)
+  {
+    throw std::runtime_error("BLAKE2b failed");
+  }
+  constexpr char digits[] = "0123456789abcdef";
+  PartKey key{data.size(), ""};
+  for (const auto byte : digest) {
+    key.digest += {digits[byte >> 4], digits[byte & 0xF]};
+  }
+  return key;
 }
 
 CutAssembler::CutAssembler(const AssemblerLimits & limits)

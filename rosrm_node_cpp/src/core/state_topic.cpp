@@ -15,15 +15,20 @@ StateTopic::StateTopic(std::string topic, std::string type, Save save, Restore r
 void StateTopic::show_to(std::function<void(const Bytes &)> publish)
 {
   publish_ = std::move(publish);
-  published_.reset();
+  is_shown_ = false;
 }
 
 void StateTopic::publish()
 {
   refresh();
-  if (key_ && !(published_ && *published_ == *key_)) {
-    publish_(data_);
-    published_ = key_;
+  show();
+}
+
+void StateTopic::show()
+{
+  if (data_ && !is_shown_) {
+    publish_(*data_);
+    is_shown_ = true;
   }
 }
 
@@ -33,11 +38,14 @@ void StateTopic::refresh()
     auto data = checked();
     if (data) {
       refused_.clear();
-      key_ = part_key(*data);
-      data_ = std::move(*data);
+      if (data != data_) {
+        data_ = std::move(data);
+        key_.reset();
+        is_shown_ = false;
+      }
     }
   } catch (const StateError & error) {
-    key_.reset();  // a later "unchanged" would refer to a state never saved
+    data_.reset();  // a later "unchanged" would refer to a state never saved
     if (refused_.empty()) {
       refused_ = error.what();
     }
@@ -53,7 +61,7 @@ std::optional<Bytes> StateTopic::checked()
   } catch (const std::exception & error) {
     throw StateError("saving " + topic_ + " raised " + error.what());
   }
-  if (!data && !key_) {
+  if (!data && !data_) {
     throw StateError(
             !refused_.empty() ? refused_ : "saving " + topic_ +
             " returned none (unchanged) before it had returned any state");
@@ -69,16 +77,21 @@ std::optional<Bytes> StateTopic::checked()
 
 const Bytes & StateTopic::saved() const
 {
-  if (!key_) {
+  if (!data_) {
     throw StateError("the state on " + topic_ + " was not saved");
   }
-  return data_;
+  return *data_;
 }
 
 StatePart StateTopic::described() const
 {
-  const PartKey key = key_.value_or(PartKey{});
-  return {topic_, type_, key.size, key.digest};
+  if (!data_) {
+    return {topic_, type_, 0, ""};
+  }
+  if (!key_) {
+    key_ = part_key(*data_);
+  }
+  return {topic_, type_, key_->size, key_->digest};
 }
 
 void StateTopic::restore_changed(const Bytes & data)
@@ -94,7 +107,7 @@ void StateTopic::restore_changed(const Bytes & data)
   }
   restored_ = key_ = key;  // the author's next `save` may return none, which refers to this state
   data_ = data;
-  published_.reset();
+  is_shown_ = false;
 }
 
 std::string differing_part(const StateTopics & parts, const StateMark & mark)

@@ -57,6 +57,9 @@ private:
   void look();
   void go_on();
   bool restore(Cut cut);
+  bool has_lost_history();
+  bool is_unsure();
+  void ask_for_history();
   void review();
   bool is_last() const;
   std::uint64_t sequence() const;
@@ -88,6 +91,7 @@ private:
   bool alone_ = false;
   bool active_ = false;
   double last_report_ = 0.0;
+  double asked_at_ = -1.0;
   std::optional<double> matched_at_;
   bool was_ready_ = false;
   bool may_switch_ = false;

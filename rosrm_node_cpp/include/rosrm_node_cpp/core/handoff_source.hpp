@@ -44,9 +44,10 @@ private:
   void open(const StateConfig & config);
   void show_part(StateTopic & part);
   void after_cycle();
-  bool show(bool last = false);
+  bool show(bool is_whole = false, bool last = false);
+  void show_history();
   void failed(const std::string & fault);
-  StateMark mark(bool last);
+  StateMark mark(bool is_whole, bool last);
   std::vector<std::int64_t> still_due();
   void take_report(const HandoffReport & report);
   void close_services();

@@ -6,6 +6,7 @@
 #include <deque>
 #include <functional>
 #include <map>
+#include <memory>
 #include <optional>
 #include <set>
 #include <string>
@@ -13,6 +14,20 @@
 
 namespace rosrm_node
 {
+
+/// Newest processed messages of each input that a source remembers. Its whole marks name all of
+/// them, so a follower that has missed marks learns what these covered.
+constexpr std::size_t kHistory = 8192;
+
+/// Knowledge of the messages of an input that the source has processed.
+enum class Known
+{
+  kAll,
+  /// Marks are missing; the next whole mark names what they covered.
+  kGap,
+  /// The source does not remember all of it any more.
+  kLost
+};
 
 /// Time and order of one sent message.
 struct Sent
@@ -23,12 +38,28 @@ struct Sent
   std::uint64_t number = 0;
 };
 
+/// Received messages with consecutive numbers, so of one publisher.
+struct PublisherOrder
+{
+  /// Number of the last one.
+  std::uint64_t last = 0;
+  /// A message of this publisher may be missing. A state that covers a later one covers that too,
+  /// because the source receives each publisher's messages in order.
+  bool after_gap = false;
+  /// The next message may be of another publisher, because a message was missing since.
+  bool broken = false;
+};
+
 /// One message in the buffer.
 struct BufferedMessage
 {
   std::string input;
   std::int64_t stamp = 0;
   std::size_t size = 0;
+  /// Of its publisher.
+  std::shared_ptr<PublisherOrder> order;
+  /// Of the received messages of its input.
+  std::size_t number = 0;
   /// Lets the author's callback process the message.
   std::function<void()> serve;
 };
@@ -42,6 +73,16 @@ public:
   /// \param now monotonic seconds.
   InputBuffer(std::size_t limit, std::size_t room, double now);
 
+  /// The source may be silent, and would not process a message that is lost here.
+  bool is_last = false;
+
+  /// Note that the reader was full, and may have dropped messages for those received last. Of one
+  /// publisher the next number shows a loss; of several ones perhaps too late.
+  void overran(const std::string & input);
+
+  /// Return the number of received messages.
+  std::size_t received(const std::string & input) {return track(input).received;}
+
   /// Mark an input as unordered: its publishers' clocks cannot be compared.
   void mix(const std::string & input);
 
@@ -51,10 +92,12 @@ public:
     std::size_t size = 0);
 
   /// Record that a state covers these messages; drop them now, or when they arrive.
+  /// \param processed position of the last one; the others have the positions before.
   /// \param single the topic has one publisher: the source has skipped any message that is older
   ///   than the newest covered one.
   void cover(
-    const std::string & input, const std::vector<std::int64_t> & stamps, bool single, double now);
+    const std::string & input, const std::vector<std::int64_t> & stamps, std::uint64_t processed,
+    bool single, double now);
 
   /// Return true if a received message is covered too; after that message none is missing.
   bool overlaps(const std::string & input);
@@ -62,8 +105,12 @@ public:
   /// Return true if the one publisher's newest covered message has not arrived here.
   bool is_behind(const std::string & input);
 
-  /// Return true if a sent message has not arrived, and no state covers it.
+  /// Return true if a sent message may not have arrived, and no state covers it.
   bool misses_one(const std::string & input);
+
+  /// Return the knowledge of the messages that the source has processed. With one publisher the
+  /// newest one is enough, as all before it were processed or skipped.
+  Known known(const std::string & input);
 
   /// Return true if the input is quiet: nothing is buffered, and for some seconds, which begin at
   /// `since` at the earliest, no message has reached this node or its source.
@@ -85,19 +132,38 @@ private:
     std::set<std::int64_t> covered;
     std::deque<std::int64_t> order;
     std::optional<std::int64_t> newest;
+    /// Time stamps may decrease: several publishers, or one restarted with its clock behind.
     bool mixed = false;
+    /// Several threads take the messages, so that numbers show no loss.
+    bool unordered = false;
     bool overlap = false;
     std::size_t held = 0;
-    std::optional<Sent> last;
-    /// Time stamp of the message after a missing one.
-    std::optional<std::int64_t> after_gap;
+    /// Messages received so far.
+    std::size_t received = 0;
+    /// Time stamp of the last one.
+    std::optional<std::int64_t> last;
+    std::deque<std::shared_ptr<PublisherOrder>> orders;
+    /// Position of the newest message that a mark has named.
+    std::uint64_t processed = 0;
+    /// Position up to which marks have named all processed messages that came or may come here;
+    /// none: the source may have forgotten one of them.
+    std::optional<std::uint64_t> known;
+    /// Number of the last received message that the source may have processed and forgotten: what
+    /// came before the first whole mark.
+    std::optional<std::size_t> doubtful;
+    /// Number of the last received message when the reader was full; 0: it never was.
+    std::size_t overrun = 0;
+    /// The reader was full during the switch.
+    bool overrun_last = false;
 
-    void note_order(const Sent & sent);
+    std::shared_ptr<PublisherOrder> note_order(const Sent & sent);
+    void note_history(std::uint64_t processed, std::size_t count);
     bool covers(std::int64_t stamp) const;
   };
 
   Track & track(const std::string & input);
   void drop_covered(const std::string & input, Track & track);
+  bool holds(const std::string & input, std::size_t number) const;
 
   std::size_t limit_;
   std::size_t room_;

@@ -65,13 +65,14 @@ struct StatePart
   std::string topic;
   std::string type;
   std::uint64_t size = 0;
-  std::uint32_t digest = 0;
+  std::string digest;
 };
 
 struct CoveredInput
 {
   std::string topic;
   std::uint32_t publishers = 0;
+  std::uint64_t processed = 0;
   std::vector<std::int64_t> covered;
 };
 
@@ -111,7 +112,7 @@ Bytes encoded(const HandoffReport & report);
 Bytes encoded(const StateMark & mark);
 Bytes encoded(const Sealed & sealed);
 
-/// Return the message in CDR bytes.
+/// Return the message in CDR bytes; a mark also of an earlier protocol version, from a snapshot.
 /// \throws Malformed the bytes are no such message.
 StateConfig decoded_config(const Bytes & data);
 HandoffReport decoded_report(const Bytes & data);

@@ -37,12 +37,19 @@ struct Input
   bool buffered = true;
   /// Every message counts, not only the newest: a reliable input with a depth above 1.
   bool wants_all = false;
+  /// Most messages that the reader keeps; 0: unlimited.
+  std::size_t depth = 0;
   /// Returns the number of matched publishers.
   std::function<std::uint32_t()> publishers;
   /// Gives all waiting messages to `NodeEntities::keep`.
   std::function<void()> take_waiting;
   /// Source time stamps of the newest processed messages, ns.
   std::deque<std::int64_t> covered;
+  /// Position of the last one.
+  std::uint64_t processed = 0;
+
+  /// Note a processed message by its source time stamp.
+  void note(std::int64_t stamp);
 };
 
 /// One publisher of the author.
@@ -146,6 +153,9 @@ public:
   /// Return an input that has lost a message and needs every one; "" if there is none.
   std::string input_with_gap();
 
+  /// Return an input of which the buffer has this knowledge; "" if there is none.
+  std::string input_known(Known known);
+
   /// Return true while buffered messages may be left; new messages then queue behind them.
   bool is_replaying() const {return replay_ != 0;}
 
@@ -160,7 +170,8 @@ public:
   bool close_next_service();
 
   /// Return the processed messages of each buffered input, for a mark of the state.
-  std::vector<CoveredInput> covered_inputs() const;
+  /// \param is_whole the mark names all that this node remembers, not only the newest.
+  std::vector<CoveredInput> covered_inputs(bool is_whole = false) const;
 
   /// Drop messages that a state covers, now or when they arrive.
   void cover(const std::vector<CoveredInput> & covered);
@@ -183,6 +194,7 @@ public:
 private:
   InputBuffer new_buffer();
   bool is_late(const Input & input, const Sent & sent);
+  void take_waiting(Input & input, std::size_t taken = 0);
   void replay();
   bool serve_until(double end);
   bool serve_next();

@@ -16,11 +16,13 @@
 namespace rosrm_node
 {
 
-/// Size and CRC-32, which identify the content of one serialised message.
+/// Size and digest, which identify the content of one serialised message.
 struct PartKey
 {
   std::uint64_t size = 0;
-  std::uint32_t digest = 0;
+  /// BLAKE2b in hexadecimal digits. (A CRC would not do: a content that ends with its own CRC, as
+  /// those of many formats do, has always the same one.)
+  std::string digest;
 
   bool operator==(const PartKey & other) const
   {

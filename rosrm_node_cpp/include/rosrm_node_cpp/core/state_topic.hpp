@@ -46,11 +46,14 @@ public:
   /// Use a function from now on; the next call publishes the part for the new successor.
   void show_to(std::function<void(const Bytes &)> publish);
 
-  /// Publish the part, if it has changed.
-  /// \throws StateError the part cannot be saved, or is too large.
+  /// Save the part and publish it, if it has changed; throws the errors of `refresh`.
   void publish();
 
-  /// Save the part, if it has changed; throws the errors of `publish`.
+  /// Publish the saved part, if its successor does not have it.
+  void show();
+
+  /// Save the part, if it has changed.
+  /// \throws StateError the part cannot be saved, or is too large.
   void refresh();
 
   /// Return the saved message.
@@ -71,10 +74,12 @@ private:
   Save save_;
   Restore restore_;
   std::function<void(const Bytes &)> publish_ = [](const Bytes &) {};
-  std::optional<PartKey> key_;
-  std::optional<PartKey> published_;
+  /// The saved message.
+  std::optional<Bytes> data_;
+  bool is_shown_ = false;
+  /// Of the saved message, once it was computed.
+  mutable std::optional<PartKey> key_;
   std::optional<PartKey> restored_;
-  Bytes data_;
   std::string refused_;
 };
 

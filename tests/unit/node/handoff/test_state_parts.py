@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import pytest
-from std_msgs.msg import Int64, String
+from hypothesis import given
+from hypothesis import strategies as st
+from std_msgs.msg import Int64, String, UInt8MultiArray
 
 from rosrm.node.handoff import state_parts
 from rosrm.node.handoff.state_parts import StateError, StateTopic
@@ -49,3 +54,30 @@ def test_an_unchanged_part_is_shown_once_to_each_successor():
         one.publish()
         one.publish()
     assert shown == [("a", 12), ("b", 12)]
+
+
+def ends_with_its_crc(number):
+    """Return a state whose CRC-32 is the same for each number."""
+    record = struct.pack("<Q", number)
+    return UInt8MultiArray(data=record + struct.pack("<I", zlib.crc32(record)))
+
+
+@given(st.lists(st.integers(0, 3), min_size=1))
+def test_each_change_of_a_state_is_published_named_and_restored(numbers):
+    """Many formats end with a CRC, so that all contents of one size have the same CRC."""
+    states, published, restored = iter(numbers), [], []
+    one = StateTopic(
+        "/state", UInt8MultiArray, lambda: ends_with_its_crc(next(states)), lambda message: None
+    )
+    other = StateTopic("/state", UInt8MultiArray, lambda: None, restored.append)
+    one.show_to(published.append)
+    keys = {}
+    for number in numbers:
+        one.publish()
+        other.restore_changed(published[-1])
+        assert restored[-1] == ends_with_its_crc(number)
+        keys[number] = one.described().digest
+        assert one.block().data == published[-1]
+    assert len(set(keys.values())) == len(set(numbers))
+    changes = [b for a, b in zip([None, *numbers], numbers, strict=False) if a != b]
+    assert len(published) == len(restored) == len(changes)
