@@ -214,9 +214,15 @@ class Client:
         """Return an application; raise `Refused` for an unknown name."""
         return row_of("application", name, {row.name: row for row in self.list_applications()})
 
-    def cancel(self, processes: Names) -> str:
-        """Take processes out of the queue, or stop them for good; return the master's message."""
-        return self._master.cancel(_list(processes))
+    def cancel(self, processes: Names, *, force: bool = False) -> str:
+        """Take processes out of the queue, or stop them for good; return the master's message.
+
+        Args:
+            processes: names of the processes.
+            force: True: kill them at once (SIGKILL), also those that are being stopped already.
+                Only operators may.
+        """
+        return self._master.cancel(_list(processes), force=force)
 
     def restart(self, processes: Names) -> str:
         """Restart processes on their hosts, or queue ended ones; return the master's message."""

@@ -26,6 +26,7 @@ from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import limits_fault
 from rosrm.model.placeholders import ARTIFACTS, DEVICE, WITH_PLACEHOLDERS, placeholder_faults
 from rosrm.model.secret_rules import is_variable, secret_faults
+from rosrm.model.stop_rules import stop_fault
 from rosrm.model.values import Kind, ProcessSpec, StartOrder
 from rosrm.wording import listed
 
@@ -179,7 +180,7 @@ def _about_gang(spec: ProcessSpec) -> Iterator[Complaint]:
 
 
 def _about_limits(spec: ProcessSpec) -> Iterator[Complaint]:
-    fault = limits_fault(spec)
+    fault = limits_fault(spec) or stop_fault(spec)
     if fault:
         yield Complaint((fault.partition(".")[0].partition(":")[0],), fault)
 

@@ -125,6 +125,7 @@ ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
     "migrate": _SUBMITTERS,
     "checkpoint": _SUBMITTERS,
     "restore": _SUBMITTERS,
+    "kill": _OPERATORS,
     "prune": _OPERATORS,
     "rebalance": _OPERATORS,
     "reload": _OPERATORS,

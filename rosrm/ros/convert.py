@@ -44,6 +44,7 @@ from rosrm.model.parameters import pattern_fault
 from rosrm.model.remembered import remembered
 from rosrm.model.rows import EventRow, HostRow, PluginRow, ProcessRow, ResourceRow
 from rosrm.model.secret_rules import secrets_fault
+from rosrm.model.stop_rules import stop_fault
 from rosrm.ros.bounds import MOST_LETTERS
 from rosrm.ros.cdr import made
 from rosrm.wording import sanitized, sendable
@@ -271,6 +272,7 @@ def spec_from_msg(message: msg.ProcessSpec) -> values.ProcessSpec:
     )  # fmt: skip
     checks = (
         limits_fault,
+        stop_fault,
         job_fault,
         secrets_fault,
         container_fault,

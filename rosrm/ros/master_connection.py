@@ -379,9 +379,10 @@ class MasterClient:
         else:
             _spin(self._joined, timeout)
 
-    def cancel(self, processes: Sequence[str]) -> str:
-        """Remove processes from the queue, or stop them."""
-        return self._ask(srv.Cancel, names.CANCEL, processes=list(processes))
+    def cancel(self, processes: Sequence[str], *, force: bool = False) -> str:
+        """Remove processes from the queue, or stop them; with `force` by SIGKILL at once."""
+        service = names.KILL if force else names.CANCEL
+        return self._ask(srv.Cancel, service, processes=list(processes))
 
     def restart(self, processes: Sequence[str]) -> str:
         """Restart processes where they run; queue ended ones again."""

@@ -10,7 +10,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from rosrm.config.settings import HostConfig
+from rosrm.core.slave import commands
 from rosrm.core.slave.state import SlaveState
+from rosrm.model.durations import LONGEST_STOP
 from rosrm.model.values import InstanceState, InstanceStatus, StopPolicy
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.slave.launch.starter import Starter
@@ -23,8 +25,8 @@ _log = logging.getLogger("rosrm.slave")
 STOP_ALL: Final = "--stop-all"
 #: Seconds for the master to acknowledge the end of this slave.
 _LEAVE_PATIENCE: Final = 2.0
-#: Seconds for a re-adopted process to end, because this run of the slave does not know its `stop`.
-_LONGEST_STOP: Final = 600.0
+#: Seconds for what is killed after the longest stop to end.
+_KILL_PATIENCE: Final = 10.0
 
 
 @dataclass
@@ -118,8 +120,9 @@ class Shutdown:
         longest = self._longest_stop()
         self._kill_at = self._next_kill()  # again, because the master's answer may take a while
         self.supervisor.shut_down()
-        deadline = time.monotonic() + longest
-        self.serve(lambda: not self.supervisor_left and time.monotonic() < deadline)
+        self._serve_for(longest)
+        if not self.supervisor_left:
+            self._kill(longest)
         if not self.supervisor_left:
             _log.error("not ended within %g s: %s", longest, self._unfinished())
             return 1
@@ -131,6 +134,20 @@ class Shutdown:
         count = counted(live, "process was stopped", "processes were stopped")
         _log.info("%s of %s ended; %s", part, self.config.host, count)
         return code
+
+    def _serve_for(self, seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        self.serve(lambda: not self.supervisor_left and time.monotonic() < deadline)
+
+    def _kill(self, longest: float) -> None:
+        """Kill what has not ended, whatever its `stop` was in the release that started it."""
+        left = [one.instance for one in _live(self._begun())]
+        if left:
+            names = listed(map(str, left))
+            _log.warning("killing (SIGKILL) %s, not ended within %g s", names, longest)
+        for instance in left:
+            self.supervisor.carry_out(commands.Fence(instance))
+        self._serve_for(_KILL_PATIENCE)
 
     def _inform_master(self, running: Sequence[InstanceStatus] = ()) -> None:
         """Report the end of this slave, and wait for the master's acknowledgement or a time-out."""
@@ -147,8 +164,9 @@ class Shutdown:
         return [one for one in self.state.statuses() if self.starter.has_begun(one.instance)]
 
     def _longest_stop(self) -> float:
-        longest = [_LONGEST_STOP if stop is None else stop.timeout for stop in self._stops()]
-        return max(longest, default=StopPolicy().timeout)
+        unknown = LONGEST_STOP  # of a re-adopted process
+        longest = [unknown if stop is None else stop.timeout for stop in self._stops()]
+        return min(max(longest, default=StopPolicy().timeout), LONGEST_STOP)
 
     def _next_kill(self) -> float:
         """Return the latest monotonic time of SIGKILL; infinite if a `stop` is unknown."""

@@ -89,7 +89,7 @@ from rosrm.core.supervisor.rules import (
     RunLimits,
     StopRule,
 )
-from rosrm.model.durations import LONGEST
+from rosrm.model.durations import LONGEST, LONGEST_STOP
 from rosrm.supervisor.json_lines import ProtocolError, line, parse
 from rosrm.supervisor.logs import LogLimits
 
@@ -348,8 +348,8 @@ def read_restart(value: Sequence[Any]) -> RestartRule:
 
 def read_stop(value: Sequence[Any]) -> StopRule:
     """Return a stop policy from its JSON list."""
-    interrupt_grace, terminate_grace = value
-    return StopRule(_wait(interrupt_grace), _wait(terminate_grace))
+    interrupt_grace, terminate_grace = (min(_wait(one), LONGEST_STOP) for one in value)
+    return StopRule(interrupt_grace, min(terminate_grace, LONGEST_STOP - interrupt_grace))
 
 
 def read_fence(value: Sequence[Any] | None) -> FenceRule | None:

@@ -90,7 +90,7 @@ def submit(
                 show_processes(client.wait(names, timeout=limit, on_change=show_change))
 
 
-def cancel(
+def cancel(  # noqa: PLR0913 - an argument for each option
     ctx: typer.Context,
     words: Annotated[
         list[str] | None,
@@ -106,6 +106,14 @@ def cancel(
     array: Array = "",
     application: Application = "",
     *,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force",
+            help="Kill them at once (SIGKILL), without the graces of their `stop`, also those that "
+            "are being stopped already. Only for operators.",
+        ),
+    ] = False,
     wait: Wait = False,
     timeout: Timeout = "",
     domain: Domain = None,
@@ -143,8 +151,8 @@ def cancel(
         if not names and not application:
             echo("no process to cancel: all of them have ended, or were never submitted")
             return
-        if not application:
-            outcome = client.cancel(names)
+        if not application or (force and names):
+            outcome = client.cancel(names, force=force)
             echo(outcome)
         # If all processes were still queued, the master's reply reports their end already.
         if wait and names and outcome != f"{counted(len(names), 'process', 'processes')} cancelled":

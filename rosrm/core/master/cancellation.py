@@ -55,6 +55,17 @@ def cancel(
     state.save(process)
 
 
+def kill(state: MasterState, process: Process, now: float) -> None:
+    """Order the slaves to kill every instance of a cancelled process (SIGKILL).
+
+    Neither the graces of its `stop` nor dependants or a migration delay the end.
+    """
+    state.start_orders.last_to_stop.pop(process.name, None)
+    for instance in state.instances_of(process):
+        instance.at_once = True
+        lifecycle.stop_instance(state, instance, now)
+
+
 def cancel_groups(state: MasterState, now: float) -> None:
     """Cancel the groups of which a process has ended in this step, if its end ends the group.
 

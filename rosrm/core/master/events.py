@@ -217,11 +217,16 @@ class ModeRequested:
 
 @dataclass(frozen=True, slots=True)
 class CancelRequested:
-    """A client cancels processes."""
+    """A client cancels processes.
+
+    Attributes:
+        at_once: kill them (SIGKILL), without the graces of their `stop`.
+    """
 
     request: int
     names: tuple[str, ...]
     by: Requester = OPERATOR
+    at_once: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ from rosrm.core.master.adoption import check_adoption
 from rosrm.core.master.assignment.assign import assign_to_adopt, reconsider_set_aside
 from rosrm.core.master.assignment.gangs import check_gangs
 from rosrm.core.master.assignment.neighbours import running_with
-from rosrm.core.master.cancellation import cancel
+from rosrm.core.master.cancellation import cancel, kill
 from rosrm.core.master.checkpoint import image_requests
 from rosrm.core.master.commands import Reply
 from rosrm.core.master.contradictions import neighbour_fault
@@ -42,6 +42,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.limits import limits_fault
 from rosrm.model.orders import RestartInstance
 from rosrm.model.requester import Requester
+from rosrm.model.stop_rules import stop_fault
 from rosrm.model.values import InstanceState, ProcessSpec
 from rosrm.wording import MOST_COMPARED, counted, listed, no_such
 
@@ -230,7 +231,7 @@ def _shared_container(state: MasterState, submitted: Sequence[ProcessSpec]) -> s
 
 def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
     """Return why limits, migration, standby or container of a spec are refused; "": not."""
-    fault = limits_fault(spec) or adoption_fault(spec)
+    fault = limits_fault(spec) or adoption_fault(spec) or stop_fault(spec)
     if fault:
         return fault
     strategy = spec.migration.strategy
@@ -305,9 +306,15 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
     processes = known_processes(state, event.names, event.by)
     terminal = [process.name for process in processes if process.phase.is_terminal]
     for process in dependants_first(state, processes):
-        if not process.phase.is_terminal:
+        if not process.phase.is_terminal and not (event.at_once and _is_cancelled(process)):
             cancel(state, process, now, by=event.by)
+        if event.at_once:
+            kill(state, process, now)
     state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
+
+
+def _is_cancelled(process: Process) -> bool:
+    return process.wanted is DesiredState.CANCEL
 
 
 def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[str]) -> str:

@@ -138,6 +138,7 @@ class MasterServices:
             (srv.LoadModes, names.LOAD_MODES, self._modes_loaded),
             (srv.SwitchMode, names.SWITCH_MODE, _mode_requested),
             (srv.Cancel, names.CANCEL, _cancelled),
+            (srv.Cancel, names.KILL, _killed),
             (srv.Restart, names.RESTART, _restarted),
             (srv.Migrate, names.MIGRATE, _migrated),
             (srv.Checkpoint, names.CHECKPOINT, _checkpointed),
@@ -486,6 +487,11 @@ def _mode_requested(request: srv.SwitchMode.Request, token: int, peer: Peer) -> 
 
 def _cancelled(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:
     return happened.CancelRequested(token, tuple(request.processes), _requester(peer))
+
+
+def _killed(request: srv.Cancel.Request, token: int, peer: Peer) -> happened.Event:
+    names = tuple(request.processes)
+    return happened.CancelRequested(token, names, _requester(peer), at_once=True)
 
 
 def _restarted(request: srv.Restart.Request, token: int, peer: Peer) -> happened.Event:

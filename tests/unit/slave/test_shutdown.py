@@ -7,7 +7,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from rosrm.core.slave import commands
 from rosrm.core.slave.state import HeldInstance, SlaveState
+from rosrm.model.durations import LONGEST_STOP
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, ProcessSpec, StopPolicy
 from rosrm.slave import shutdown
 from rosrm.slave.shutdown import Shutdown
@@ -21,6 +23,7 @@ class Slave:
     def __init__(self, log) -> None:
         self.now, self.log = 100.0, log
         self.when_stopped = lambda: None
+        self.carried_out = []
         self.endpoint = SimpleNamespace(
             failure="", leave=lambda done, _running: done(),
             wait_until_received=lambda: None,
@@ -31,7 +34,7 @@ class Slave:
         self.ending = Shutdown(
             SimpleNamespace(host="h0", on_stop="stop"), self.state,
             SimpleNamespace(close=lambda: None, has_begun=lambda _instance: True),
-            SimpleNamespace(pid=7, shut_down=self.shut_down),
+            SimpleNamespace(pid=7, shut_down=self.shut_down, carry_out=self.carried_out.append),
             self.endpoint, serve=self.serve,
         )  # fmt: skip
 
@@ -133,3 +136,17 @@ def test_a_time_that_is_not_known_is_not_claimed(slave) -> None:
     slave.when_stopped = lambda: slave.ending.note_supervisor_left("")
     assert slave.end() == 0
     assert slave.said[0] == "stopping 2 processes (SIGINT)"
+
+
+def test_a_stop_ends_by_a_kill_whatever_the_graces_are(slave, caplog) -> None:
+    """A process of an earlier release may have graces of thousands of hours."""
+    endless = StopPolicy(interrupt_grace=7_200_000.0, terminate_grace=7_200_000.0)
+    instance = InstanceId("endless", 1)
+    status = InstanceStatus(instance, InstanceState.STOPPING)
+    spec = ProcessSpec("endless", command=("sleep",), stop=endless)
+    slave.state.hold(instance, HeldInstance(status, spec))
+    began = slave.now
+    assert slave.end() == 1
+    assert slave.now - began < 2 * LONGEST_STOP
+    assert commands.Fence(instance) in slave.carried_out
+    assert "killing (SIGKILL)" in caplog.text
