@@ -10,8 +10,11 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import ConfigError
+from rosrm_web.master_link import Busy
 from rosrm_web.tokens import User, read_tokens
 
+#: Most requests, streams and pages that one user has open.
+MOST_OPEN: Final = 24
 #: Seconds between two looks at the file.
 PERIOD: Final = 1.0
 
@@ -65,6 +68,14 @@ class Access:
         for user, end in list(self._open.values()):
             if user not in self.users:
                 end()
+
+    def check_room(self, user: User) -> None:
+        """Refuse one more request or page of a user that leaves no room for others; raises `Busy`.
+
+        Where no tokens are required, all are one user.
+        """
+        if user in self.users and sum(one == user for one, _ in self._open.values()) >= MOST_OPEN:
+            raise Busy(f"{user.name} has {MOST_OPEN} requests and pages open; close one first")
 
     @contextmanager
     def open_request(self, user: User) -> Iterator[None]:

@@ -17,6 +17,7 @@ from rosrm_web.metrics.endpoint import Metrics
 from rosrm_web.page.login import Login
 from rosrm_web.page.site import mount
 from rosrm_web.reading import Host, Log, Reading, Status
+from rosrm_web.sessions import Sessions
 from rosrm_web.tokens import LOGIN
 
 if TYPE_CHECKING:
@@ -73,7 +74,9 @@ def routes(gateway: Gateway, access: Access) -> list[Route]:
     ]
 
 
-def create_app(gateway: Gateway, settings: Settings, access: Access) -> FastAPI:
+def create_app(
+    gateway: Gateway, settings: Settings, access: Access, sessions: Sessions | None = None
+) -> FastAPI:
     """Return the application; `guard.Guard` has to stand before it."""
     app = FastAPI(
         title="rosrm", version=__version__, openapi_url="/v1/openapi.json",
@@ -87,7 +90,7 @@ def create_app(gateway: Gateway, settings: Settings, access: Access) -> FastAPI:
         )
     for kind, handler in problems.HANDLERS.items():
         app.add_exception_handler(kind, handler)
-    login = Login(settings, access)
+    login = Login(settings, access, sessions or Sessions(access))
     app.add_api_route(LOGIN, login.show, methods=["GET"], include_in_schema=False)
     app.add_api_route(LOGIN, login.enter, methods=["POST"], include_in_schema=False)
     app.add_api_route("/v1/{path:path}", _unknown_path, include_in_schema=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import ssl
+from collections import Counter
 from typing import Any, Final, Literal, cast
 
 import h11
@@ -42,6 +43,11 @@ class Connection(H11Protocol):
         self._early = b""
         self._timers: dict[Literal["head", "read"], asyncio.TimerHandle] = {}
         self.begun = self.loop.time()
+
+    @property
+    def address(self) -> str:
+        """Return the address of the client; "": unknown."""
+        return self.client[0] if self.client else ""
 
     @property
     def waits_for_client(self) -> bool:
@@ -127,7 +133,13 @@ class Connection(H11Protocol):
 
 
 def _make_room(new: Connection) -> None:
-    """End the oldest connection that waits for its client, or the new one."""
-    others = [one for one in new.connections if isinstance(one, Connection) and one is not new]
-    waiting = [one for one in others if one.waits_for_client]
-    min(waiting, key=lambda one: one.begun, default=new).end()
+    """End a connection that waits for its client, or the new one.
+
+    Of those, the oldest one of the address with the most connections ends. So no machine that opens
+    many of them takes the places of others.
+    """
+    known = [one for one in new.connections if isinstance(one, Connection)]
+    of_address = Counter(one.address for one in known)
+    waiting = [one for one in known if one is not new and one.waits_for_client]
+    order = lambda one: (-of_address[one.address], one.begun)  # noqa: E731
+    min(waiting, key=order, default=new).end()

@@ -6,14 +6,15 @@ import asyncio
 import ipaddress
 import logging
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
-from http.cookies import SimpleCookie
 from types import MappingProxyType
 from typing import Any, Final
 
 from rosrm_web import problems
 from rosrm_web.access import Access
+from rosrm_web.master_link import Busy
+from rosrm_web.sessions import Sessions, cookie_name, cookie_of
 from rosrm_web.settings import Settings
-from rosrm_web.tokens import ANYONE, COOKIE, LOGIN, User, user_of
+from rosrm_web.tokens import ANYONE, LOGIN, User, user_of
 
 Scope = MutableMapping[str, Any]
 Message = MutableMapping[str, Any]
@@ -23,6 +24,8 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 #: Most bytes of the body of a request, such as a work file.
 LARGEST_BODY: Final = 4 * 2**20
+#: The same of a request without a token: the form with one.
+LARGEST_LOGIN: Final = 4 * 2**10
 #: Seconds for the body of a request.
 BODY_TIMEOUT: Final = 10.0
 #: Methods that change nothing.
@@ -75,9 +78,12 @@ class Rejected(Exception):
 class Guard:
     """ASGI application that checks requests, and passes valid ones to another application."""
 
-    def __init__(self, app: App, settings: Settings, access: Access) -> None:
+    def __init__(
+        self, app: App, settings: Settings, access: Access, sessions: Sessions | None = None
+    ) -> None:
         self._app = app
         self._settings, self._access = settings, access
+        self._sessions = sessions or Sessions(access)
         self._headers = {**_HEADERS, **(_WITH_TLS if settings.certificate else {})}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -92,7 +98,13 @@ class Guard:
             check_origin(scope, headers, self._settings.scheme)
             user = self.user_of_request(scope, headers)
             if scope["type"] == "http":
-                receive = await _with_body(scope, headers, receive)
+                most = LARGEST_LOGIN if scope["path"] == LOGIN else LARGEST_BODY
+                receive = await _with_body(scope, headers, receive, most)
+            self._access.check_room(user)
+        except Busy as error:
+            refusal = Rejected(429, str(error), {"retry-after": "5"})
+            await _reject(refusal, scope, receive, self._hardened(send))
+            return
         except Rejected as error:
             await _reject(error, scope, receive, self._hardened(send))
             return
@@ -108,8 +120,7 @@ class Guard:
         if scope["path"] == LOGIN:
             return ANYONE
         users = self._access.users
-        given = headers.get("authorization") or _of_cookie(headers)
-        user = user_of(given, users) if users else ANYONE
+        user = self._known_user(scope, headers) if users else ANYONE
         if user is None and scope["path"] == "/":
             raise Rejected(303, "a token is required", {"location": LOGIN})
         if user is None:
@@ -126,6 +137,13 @@ class Guard:
         if user.role != "operator":
             raise Rejected(403, f"{user.name} is a {user.role}: only operators may act")
         return user
+
+    def _known_user(self, scope: Scope, headers: Mapping[str, str]) -> User | None:
+        """Return the user of the token of a request, or else of its cookie."""
+        if "authorization" in headers:
+            return user_of(headers["authorization"], self._access.users)
+        name = cookie_name(is_secure=self._settings.certificate is not None, port=port_of(scope))
+        return self._sessions.user_of(cookie_of(headers.get("cookie", ""), name))
 
     def _hardened(self, send: Send, note: str = "", *, is_page: bool = False) -> Send:
         """Return `send` with the headers of every answer; an application may set its own.
@@ -149,10 +167,9 @@ class Guard:
         return send_hardened
 
 
-def _of_cookie(headers: Mapping[str, str]) -> str:
-    """Return the token of the cookie as the value of an Authorization header; "": none."""
-    token = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
-    return "" if token is None else f"Bearer {token.value}"
+def port_of(scope: Scope) -> int:
+    """Return the port of the gateway to which a request was sent; 0: unknown."""
+    return int((scope.get("server") or ("", 0))[1] or 0)
 
 
 def single_headers(headers: list[tuple[bytes, bytes]]) -> Mapping[str, str]:
@@ -206,13 +223,15 @@ def check_origin(scope: Scope, headers: Mapping[str, str], scheme: str) -> None:
         raise Rejected(403, f"a page of another origin sent the request: {origin!r:.100}")
 
 
-async def _with_body(scope: Scope, headers: Mapping[str, str], receive: Receive) -> Receive:
-    """Read the whole body, and return a `receive` that repeats it."""
+async def _with_body(
+    scope: Scope, headers: Mapping[str, str], receive: Receive, most: int
+) -> Receive:
+    """Read the whole body of at most so many bytes, and return a `receive` that repeats it."""
     announced = headers.get("content-length", "0")
-    if announced.isdecimal() and int(announced) > LARGEST_BODY:
-        raise _too_large()
+    if announced.isdecimal() and (len(announced) > 15 or int(announced) > most):
+        raise _too_large(most)
     try:
-        body = await asyncio.wait_for(_body(receive), BODY_TIMEOUT)
+        body = await asyncio.wait_for(_body(receive, most), BODY_TIMEOUT)
     except asyncio.TimeoutError:
         raise Rejected(408, f"the body did not arrive within {BODY_TIMEOUT:g} s") from None
     if body and scope["method"] in _SAFE:
@@ -225,7 +244,7 @@ async def _with_body(scope: Scope, headers: Mapping[str, str], receive: Receive)
     return repeat
 
 
-async def _body(receive: Receive) -> bytes:
+async def _body(receive: Receive, most: int) -> bytes:
     parts: list[bytes] = []
     size = 0
     while True:
@@ -234,14 +253,14 @@ async def _body(receive: Receive) -> bytes:
             raise Rejected(400, "the client left before its request was complete")
         parts.append(message.get("body", b""))
         size += len(parts[-1])
-        if size > LARGEST_BODY:
-            raise _too_large()
+        if size > most:
+            raise _too_large(most)
         if not message.get("more_body", False):
             return b"".join(parts)
 
 
-def _too_large() -> Rejected:
-    return Rejected(413, f"the body of a request is at most {LARGEST_BODY} bytes")
+def _too_large(most: int) -> Rejected:
+    return Rejected(413, f"the body of this request is at most {most} bytes")
 
 
 async def _reject(error: Rejected, scope: Scope, receive: Receive, send: Send) -> None:

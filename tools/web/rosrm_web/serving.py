@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import logging
+import math
+import resource
 import signal
 import socket
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Final, cast
+from typing import TYPE_CHECKING, Any, Final, cast
 
 import uvicorn
 
@@ -18,11 +22,23 @@ from rosrm_web.access import Access
 from rosrm_web.app import create_app
 from rosrm_web.connections import MOST_CONNECTIONS, Connection
 from rosrm_web.guard import Guard
+from rosrm_web.sessions import Sessions
 
 if TYPE_CHECKING:
     from rosrm_web.gateway import Gateway
     from rosrm_web.guard import App
     from rosrm_web.settings import Settings
+
+#: Connections that are accepted in one turn of the loop, and that the kernel keeps until then.
+_BACKLOG: Final = 64
+#: Open files that the gateway needs at most: connections, and ROS.
+_DESCRIPTORS: Final = 8192
+#: Errors of a process or machine without room for another open file.
+_NO_ROOM: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+#: Least seconds between two log lines about them.
+_LOGGED_EVERY: Final = 10.0
+
+_log = logging.getLogger("rosrm.web")
 
 #: Bytes of the request line and the headers.
 _LARGEST_HEAD: Final = 16 * 1024
@@ -77,8 +93,50 @@ def serve(
         ready: called once when the gateway answers requests.
     """
     access = Access(settings.users, settings.tokens)
-    server = http_server(Guard(create_app(gateway, settings, access), settings, access), settings)
+    sessions = Sessions(access)
+    app = create_app(gateway, settings, access, sessions)
+    server = http_server(Guard(app, settings, access, sessions), settings)
+    allow_descriptors()
     asyncio.run(_serve(gateway, access, server, listener, ready))
+
+
+def allow_descriptors() -> None:
+    """Let this process have more open files than its connections take.
+
+    Otherwise a flood of connections would leave none for the client of the master.
+    """
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _DESCRIPTORS if hard == resource.RLIM_INFINITY else min(_DESCRIPTORS, hard)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+
+
+class AcceptErrors:
+    """Handler of the loop's exceptions: a flood of connections must not flood the log.
+
+    asyncio reports each connection that cannot be accepted with a traceback, thousands a second.
+
+    Args:
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock = clock
+        self._logged, self._more = -math.inf, 0
+
+    def __call__(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Log an exception; those of accepting at most every `_LOGGED_EVERY` seconds."""
+        error = context.get("exception")
+        if not isinstance(error, OSError) or error.errno not in _NO_ROOM:
+            loop.default_exception_handler(context)
+            return
+        now = self._clock()
+        if now - self._logged < _LOGGED_EVERY:
+            self._more += 1
+            return
+        more = f"; {self._more} more since the last line" if self._more else ""
+        _log.error("connections: cannot accept one: %s%s", error.strerror, more)
+        self._logged, self._more = now, 0
 
 
 def http_server(app: App, settings: Settings) -> uvicorn.Server:
@@ -88,6 +146,7 @@ def http_server(app: App, settings: Settings) -> uvicorn.Server:
         app, loop="asyncio", http=cast("type[asyncio.Protocol]", protocol), lifespan="on",
         log_config=None, access_log=False, server_header=False, proxy_headers=False,
         h11_max_incomplete_event_size=_LARGEST_HEAD, timeout_graceful_shutdown=1,
+        backlog=_BACKLOG,
         ws_max_size=_LARGEST_MESSAGE,
     ))  # fmt: skip
 
@@ -97,6 +156,7 @@ async def _serve(
     ready: Callable[[], None],
 ) -> None:  # fmt: skip
     loop = asyncio.get_running_loop()
+    loop.set_exception_handler(AcceptErrors())
 
     def stop() -> None:
         server.should_exit = True

@@ -16,8 +16,6 @@ from rosrm_web.private_files import check_private
 #: A viewer reads; an operator acts, too.
 Role = Literal["viewer", "operator"]
 
-#: Name of the cookie with the token, which the form of the page sets.
-COOKIE: Final = "rosrm_token"
 #: Path of that form, which needs no token.
 LOGIN: Final = "/login"
 

@@ -194,3 +194,21 @@ def test_a_handshake_that_never_ends_is_dropped(monkeypatch, tmp_path):
         assert await ended(silent) == b""
 
     run(scene, Settings(certificate=file, key=tmp_path / "key.pem"))
+
+
+def test_connections_of_one_address_end_none_of_another(monkeypatch):
+    """A flood of one machine ends its own connections, not the older one of another machine."""
+    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 8)
+
+    async def scene(*address):
+        other = await asyncio.open_connection(*address, local_addr=("127.0.0.2", 0))
+        other[1].write(HEAD)
+        flood = []
+        for _ in range(30):
+            flood.append(await asyncio.open_connection(*address))
+            flood[-1][1].write(HEAD)
+            await asyncio.sleep(0)
+        assert await ended(flood[0][0]) == b""
+        assert await answered(*other, b"\r\n")
+
+    run(scene)

@@ -9,6 +9,7 @@ import pytest
 
 from rosrm_web import guard
 from rosrm_web.access import Access
+from rosrm_web.sessions import Sessions
 from rosrm_web.settings import Settings
 from rosrm_web.tokens import User
 
@@ -36,7 +37,7 @@ class Seen:
         await send({"type": "http.response.body"})
 
 
-def request(wanted, *parts, app=None):
+def request(wanted, *parts, app=None, sessions=None):
     """Pass a request with the parts of its body; return the status, or the code of a WebSocket."""
     messages = [
         {"type": "http.request", "body": part, "more_body": True} for part in parts
@@ -49,7 +50,8 @@ def request(wanted, *parts, app=None):
     async def send(message):
         sent.append(message)
 
-    asyncio.run(guard.Guard(app or Seen(), ACTING, Access(ACTING.users))(wanted, receive, send))
+    checked = guard.Guard(app or Seen(), ACTING, Access(ACTING.users), sessions)
+    asyncio.run(checked(wanted, receive, send))
     return sent[0]
 
 
@@ -172,14 +174,19 @@ def test_every_answer_has_the_headers_of_a_strict_page():
     assert dict(own)[b"x-content-type-options"] == b"nosniff"
 
 
-def test_the_cookie_of_the_form_is_a_token():
-    """Browsers send no Authorization header for a page."""
-    cookie = f"other=1; rosrm_token={TOKEN}"
+@pytest.mark.parametrize("other", ["other=1", "a@b=c", "=", "a@b=c; other"])
+def test_the_cookie_of_the_form_is_a_session(other):
+    """Browsers send no Authorization header for a page; other cookies may have any content."""
+    sessions = Sessions(Access(ACTING.users))
+    number = sessions.begin(ACTING.users[0])
 
-    assert request(scope(host="localhost", authorization="", cookie=cookie))["status"] == 204
-    assert (
-        request(scope(host="localhost", authorization="", cookie="rosrm_token=no"))["status"] == 303
-    )
+    def status(value):
+        cookie = f"{other}; rosrm-session-0={value}"
+        sent = scope(host="localhost", cookie=cookie)
+        sent["headers"] = [one for one in sent["headers"] if one[0] != b"authorization"]
+        return request(sent, sessions=sessions)["status"]
+
+    assert [status(value) for value in (number, "no", TOKEN)] == [204, 303, 303]
 
 
 def test_a_browser_without_a_token_is_led_to_the_form():

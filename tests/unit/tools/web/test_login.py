@@ -11,6 +11,7 @@ from fastapi import Request
 
 from rosrm_web.access import Access
 from rosrm_web.page.login import Login
+from rosrm_web.sessions import Sessions
 from rosrm_web.settings import Settings
 from rosrm_web.tokens import User
 
@@ -28,8 +29,9 @@ def test_the_log_says_who_logs_in(caplog, token, status, line):
     async def receive():
         return {"type": "http.request", "body": f"token={token}".encode()}
 
+    access = Access(USERS)
     form = Request({"type": "http", "method": "POST", "path": "/login", "headers": []}, receive)
     with caplog.at_level(logging.INFO, "rosrm.web"):
-        answer = asyncio.run(Login(Settings(users=USERS), Access(USERS)).enter(form))
+        answer = asyncio.run(Login(Settings(users=USERS), access, Sessions(access)).enter(form))
 
     assert (answer.status_code, caplog.messages) == (status, [line])

@@ -1,4 +1,4 @@
-"""Form for the token of a user; a cookie carries it from then on."""
+"""Form for the token of a user; a cookie has the id of a session from then on."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from urllib.parse import parse_qs
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
-from rosrm_web.tokens import COOKIE, user_of
+from rosrm_web.guard import port_of
+from rosrm_web.sessions import LIFETIME, cookie_name
+from rosrm_web.tokens import user_of
 
 if TYPE_CHECKING:
     from rosrm_web.access import Access
+    from rosrm_web.sessions import Sessions
     from rosrm_web.settings import Settings
 
 _log = logging.getLogger("rosrm.web")
@@ -31,8 +34,8 @@ autocomplete="current-password"></label> <button>Log in</button></form></main></
 class Login:
     """Endpoints of the form."""
 
-    def __init__(self, settings: Settings, access: Access) -> None:
-        self._settings, self._access = settings, access
+    def __init__(self, settings: Settings, access: Access, sessions: Sessions) -> None:
+        self._settings, self._access, self._sessions = settings, access, sessions
 
     async def show(self) -> Response:
         """Show the form."""
@@ -41,16 +44,21 @@ class Login:
     async def enter(self, request: Request) -> Response:
         """Check the token of the form, and set the cookie."""
         body = (await request.body()).decode("latin-1")
-        token = parse_qs(body).get("token", [""])[0].strip()
+        try:
+            token = parse_qs(body, max_num_fields=4).get("token", [""])[0].strip()
+        except ValueError:
+            token = ""
         user = user_of(f"Bearer {token}", self._access.users)
         if user is None:
             _log.warning("a wrong token was given in the form")
             return _page("The token is wrong.", 401)
         _log.info("%s: logged in", user.name)
         answer = RedirectResponse("/", 303)
+        is_secure = self._settings.certificate is not None
         answer.set_cookie(
-            COOKIE, token, httponly=True, samesite="strict",
-            secure=self._settings.certificate is not None,
+            cookie_name(is_secure=is_secure, port=port_of(request.scope)),
+            self._sessions.begin(user), max_age=int(LIFETIME), httponly=True, samesite="strict",
+            secure=is_secure, path="/",
         )  # fmt: skip
         return answer
 

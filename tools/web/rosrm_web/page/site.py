@@ -6,7 +6,7 @@ import logging
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
-from fastapi import Depends
+from fastapi import Depends, Request
 from fastapi.middleware.gzip import GZipMiddleware
 from nicegui import Client, ui
 from nicegui import app as nicegui_app
@@ -68,7 +68,7 @@ def mount(app: FastAPI, gateway: Gateway, access: Access) -> None:
     """Add the page to the application of the gateway, at `/`."""
     live, feed = Live(gateway), Feed(gateway)
     nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
-    room = [Depends(partial(_check_room, live))]
+    room = [Depends(partial(_check_room, live, access))]
     page = ui.page("/", title="rosrm", dark=None, reconnect_timeout=_ABSENCE, dependencies=room)
     page(partial(_page, gateway, access, live, feed))
     ui.run_with(
@@ -83,8 +83,9 @@ def _quickly(app: ASGIApp) -> GZipMiddleware:
     return GZipMiddleware(app, compresslevel=1)
 
 
-async def _check_room(live: Live) -> None:
+async def _check_room(live: Live, access: Access, request: Request) -> None:
     """Refuse one more page; raises `Busy`."""
+    access.check_room(request.scope["user"])
     if len(live.on_change) >= MOST_PAGES:
         Client.prune_instances(client_age_threshold=_UNUSED)
     if len(live.on_change) >= MOST_PAGES:

@@ -1,0 +1,78 @@
+"""Sessions of browsers: a random id in a cookie stands for a token, which no cookie carries."""
+
+from __future__ import annotations
+
+import hashlib
+import secrets
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Final
+
+if TYPE_CHECKING:
+    from rosrm_web.access import Access
+    from rosrm_web.tokens import User
+
+#: Seconds after which a browser has to give the token again.
+LIFETIME: Final = 12 * 3600.0
+#: Most sessions of one user; a further one ends the oldest.
+MOST_OF_USER: Final = 32
+
+
+class Sessions:
+    """Sessions of this run of the gateway; another gateway, or the next run, knows none of them.
+
+    A session ends with the token of its user, because then `access` has that user no more.
+
+    Args:
+        access: has the users whose tokens are valid.
+        clock: monotonic seconds.
+    """
+
+    def __init__(self, access: Access, clock: Callable[[], float] = time.monotonic) -> None:
+        self._access = access
+        self._clock = clock
+        #: Digest of each id to its user and end; the ids are not kept.
+        self._known: dict[bytes, tuple[User, float]] = {}
+
+    def begin(self, user: User) -> str:
+        """Return the id of a new session."""
+        self._known = {
+            key: known for key, known in self._known.items() if self._is_valid(*known)
+        }  # fmt: skip
+        own = [key for key, (known, _) in self._known.items() if known == user]
+        for key in own[: max(0, len(own) + 1 - MOST_OF_USER)]:
+            del self._known[key]
+        number = secrets.token_urlsafe(32)
+        self._known[_digest(number)] = user, self._clock() + LIFETIME
+        return number
+
+    def user_of(self, number: str) -> User | None:
+        """Return the user of a session; None: there is none, or it has ended."""
+        known = self._known.get(_digest(number))
+        return known[0] if known is not None and self._is_valid(*known) else None
+
+    def _is_valid(self, user: User, end: float) -> bool:
+        return self._clock() < end and user in self._access.users
+
+
+def cookie_name(*, is_secure: bool, port: int) -> str:
+    """Return the name of the cookie.
+
+    Browsers accept `__Host-` only over HTTPS, for the whole host and no other. Without HTTPS they
+    send a cookie to all ports of the host, so the name has the port: no gateway replaces the cookie
+    of another one.
+    """
+    return "__Host-rosrm-session" if is_secure else f"rosrm-session-{port}"
+
+
+def cookie_of(header: str, name: str) -> str:
+    """Return the value of a cookie in a header, which may have any content; "": it is not there."""
+    for part in header.split(";"):
+        key, _, value = part.strip().partition("=")
+        if key == name:
+            return value.strip('"')
+    return ""
+
+
+def _digest(number: str) -> bytes:
+    return hashlib.sha256(number.encode(errors="surrogateescape")).digest()
