@@ -49,4 +49,4 @@ def note_running(state: MasterState, process: Process, owner: Instance) -> None:
 
 def end_adoption(state: MasterState, process: Process) -> None:
     """Note that the adoption of a process has succeeded or failed: later runs are started."""
-    state.set_spec(process, replace(process.spec, adoption=NO_ADOPTION))
+    state.amend_spec(process, replace(process.spec, adoption=NO_ADOPTION))

@@ -30,6 +30,7 @@ from rosrm.model.values import (
     InstanceState,
     InstanceStatus,
     Kind,
+    ProcessSpec,
     RestartPolicy,
 )
 from rosrm.wording import standing
@@ -284,7 +285,8 @@ def _handle_unknown_instance(
         f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
-    unknown = adopt_to_stop(state, status.instance, host, now, stray=True)
+    spec = ProcessSpec(status.instance.process)
+    unknown = adopt_to_stop(state, status.instance, spec, host, now, stray=True)
     state.note_held(unknown, status.devices)
     unknown.state, unknown.pid = status.state, status.pid
     unknown.at_once = followed
@@ -293,10 +295,11 @@ def _handle_unknown_instance(
 
 
 def adopt_to_stop(
-    state: MasterState, instance: InstanceId, host: Host, now: float, *, stray: bool = False
-) -> Instance:
+    state: MasterState, instance: InstanceId, spec: ProcessSpec, host: Host, now: float, *,
+    stray: bool = False,
+) -> Instance:  # fmt: skip
     """Track an instance until it has stopped; reserve nothing, because readings show its usage."""
-    adopted = state.add_instance(instance, host, now, NO_NEEDS, stray=stray)
+    adopted = state.add_instance(instance, spec, host, now, NO_NEEDS, stray=stray)
     adopted.stopping = True
     return adopted
 
@@ -326,8 +329,8 @@ def _ended(
     state.drop_instance(instance)
     if process is None or instance.stray:
         return
-    learn_from(state, process.spec, instance, status)
-    learn_run_time(state, process.spec, status)
+    learn_from(state, instance, status)
+    learn_run_time(state, instance.spec, status)
     if status.run_time > 0.0:
         state.gangs.leave(process)
     end = _end(process, instance, status, before)
@@ -356,7 +359,7 @@ def _end(
 ) -> End:
     """Return the end of an instance: completed, ordered, or unexpected."""
     completed = (
-        process.spec.kind is Kind.JOB
+        instance.spec.kind is Kind.JOB
         and status.succeeded
         and before is not InstanceState.STOPPING
         and status.run_time > 0.0  # 0: stopped before its start

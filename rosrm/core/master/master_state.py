@@ -397,6 +397,33 @@ class MasterState:
         self.start_orders.note_change(process.name)
         self.save(process)
 
+    def amend_spec(self, process: Process, spec: ProcessSpec) -> None:
+        """Change a spec in fields that need no new start; the instances of that spec follow."""
+        former = process.spec
+        self.set_spec(process, spec)
+        for instance in self.instances_of(process):
+            if instance.spec == former:
+                instance.spec = spec
+                instance.host.instances[instance.id.number] = process.name, spec
+                if spec.needs != former.needs and not instance.stopping:
+                    needs = self.estimate(spec)
+                    instance.demand, instance.estimated = needs.amounts, needs.estimated
+                    self.reserve_rest(instance)
+
+    def replacement_of(self, process: Process) -> Migration | None:
+        """Return the migration that replaces a process by another version, before its commit."""
+        migration = self.migrations.get(process.name)
+        if migration is None or migration.spec is None or migration.committed:
+            return None
+        return migration
+
+    def spec_to_be(self, process: Process) -> ProcessSpec:
+        """Return the spec of a process after the replacement that is under way, if one is."""
+        migration = self.replacement_of(process)
+        if migration is not None and migration.spec is not None and migration.undo is None:
+            return migration.spec
+        return process.next_spec or process.spec
+
     def may_run(self, process: Process) -> bool:
         """Return True if an instance or a standby of a process may run."""
         return bool(process.instances) or process.name in self.standbys
@@ -500,13 +527,14 @@ class MasterState:
         return self.processes[name].instances
 
     def add_instance(
-        self, instance: InstanceId, host: Host, now: float, needs: Estimate | Demand,
-        fractions: FloatArray | None = None, *, devices: tuple[HeldDevice, ...] = (),
-        stray: bool = False,
+        self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float,
+        needs: Estimate | Demand, fractions: FloatArray | None = None, *,
+        devices: tuple[HeldDevice, ...] = (), stray: bool = False,
     ) -> Instance:  # fmt: skip
         """Add an instance, and reserve its needs and devices on its host.
 
         Args:
+            spec: spec with which it is started, or was started.
             fractions: (R,) needs as shares of the host's capacity, where they are known already.
             stray: the master has not assigned it to this host.
         """
@@ -514,27 +542,46 @@ class MasterState:
             fractions = self.hosts.fractions_of(host, needs.amounts, needs.estimated)
         reserved = np.where(fractions < np.inf, fractions, 0.0)
         added = Instance(
-            instance, host, now, needs.amounts, needs.estimated, reserved, devices=devices,
+            instance, host, spec, now, needs.amounts, needs.estimated, reserved, devices=devices,
             stray=stray,
         )  # fmt: skip
         self.hosts.hold(host, instance, devices)
         self.instances[instance.number] = added
-        process = self.processes.get(instance.process)
-        spec = process.spec if process is not None else ProcessSpec(instance.process)
         host.instances[instance.number] = instance.process, spec
         self._numbers_with(added).add(instance.number)
         self.hosts.add_reservation(host, reserved, processes=1)
         self.note_change(instance.process)
         return added
 
-    def reserve(self, instance: InstanceId, host: Host, now: float, ranking: Ranking) -> None:
+    def reserve(
+        self, instance: InstanceId, spec: ProcessSpec, host: Host, now: float, ranking: Ranking
+    ) -> None:
         """Add an instance on the host that a ranking has chosen."""
         demand = ranking.demand
         # Without devices the slave refuses the instance, and the process is placed elsewhere.
-        needs = demand.spec.devices
+        needs = spec.devices
         chosen = (self.hosts.devices[host.column].choose(needs) or ()) if needs else ()
         need = ranking.need[:, host.column]
-        self.add_instance(instance, host, now, demand, need, devices=chosen)
+        self.add_instance(instance, spec, host, now, demand, need, devices=chosen)
+
+    def reserve_rest(self, instance: Instance) -> None:
+        """Reserve the part of the demand of an instance that the readings do not show yet."""
+        host = instance.host
+        ended = instance.estimated if instance.settled else frozenset()
+        if instance.shown:
+            ended |= host.shared
+        left = {}
+        for resource, amount in instance.demand.items():
+            shown = instance.seen.get(resource, 0.0) if resource in host.attributed else 0.0
+            if amount > shown and resource not in ended:
+                left[resource] = amount - shown
+        fractions = self.hosts.fractions_of(host, left, instance.estimated)
+        reserved = np.where(fractions < np.inf, fractions, 0.0)
+        change = reserved.copy()
+        change[: len(instance.reserved)] -= instance.reserved
+        if np.any(change):
+            instance.reserved = reserved
+            self.hosts.add_reservation(host, change)
 
     def note_held(self, instance: Instance, devices: tuple[HeldDevice, ...]) -> None:
         """Note the devices that an instance holds by the report of its slave.

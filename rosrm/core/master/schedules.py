@@ -96,6 +96,7 @@ def _advance(state: MasterState, process: Process) -> None:
 def queue_again(state: MasterState, process: Process, now: float) -> None:
     """Queue a process that is terminal, checkpointed or between two runs, as if it were new."""
     images.drop(state, process)
+    state.clear_left_behind(process)
     replication.drop_former_replicas(state, process)
     allow_every_host(process)
     process.awaits_gang = bool(process.spec.together)

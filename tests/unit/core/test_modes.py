@@ -20,9 +20,10 @@ from rosrm.model.values import (
     InstanceState,
     InstanceStatus,
     ProcessSpec,
+    Readiness,
     StartOrder,
 )
-from tests.unit.core.cluster import Cluster, Eq1, Machine, job, movable, process
+from tests.unit.core.cluster import Cluster, Eq1, Machine, job, movable, node, process
 from tests.unit.core.test_applications import actions, new, row
 
 
@@ -232,6 +233,38 @@ def test_a_new_version_that_fails_ends_the_switch() -> None:
     cluster.wait(15.0)
     assert states(cluster) == {"exploring": "in force", "docked": ""}
     assert running(cluster) == {"planner", "driver", "mapper"}
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_switch_that_fails_returns_to_the_mode_that_was_in_force(restarted: bool) -> None:
+    """Not to one that was being reached in between, also by another master."""
+    slow = Mode("slow", (target("slow", node("late", readiness=Readiness(timeout=600.0))),))
+    broken = Mode("broken", (target("broken", node("faulty")),))
+    cluster = in_mode("docked", DOCKED, slow, broken)
+    switch(cluster, "slow")
+    assert states(cluster)["slow"] == "switching"
+    if restarted:
+        cluster.restart_master()
+    switch(cluster, "broken", 0.1)
+    cluster.finish("faulty", cluster.where("faulty")[0], code=1)
+    cluster.wait(3.0)
+    assert states(cluster)["docked"] == "in force"
+    assert cluster.recorded("mode_failed") == [
+        "the mode broken is not reached, and docked returns: faulty has failed: exit code 1"
+    ]
+
+
+def test_a_mode_that_was_never_in_force_is_not_returned_to() -> None:
+    """The first mode failed, and so does the second one: there is no mode before."""
+    modes = [Mode(name, (target(name, process(f"p_{name}")),)) for name in ("one", "two")]
+    cluster = Cluster("a")
+    load(cluster, *modes)
+    for name in ("one", "two"):
+        switch(cluster, name, 0.0)
+        cluster.finish(f"p_{name}", code=1)
+        cluster.wait(3.0)
+    assert len(cluster.recorded("mode_failed")) == 2
+    assert cluster.state.modes.wanted == "two"
 
 
 def test_an_unknown_mode_is_refused_with_the_nearest_name() -> None:

@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields, replace
-from operator import attrgetter
-from typing import Final
+from dataclasses import dataclass
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import DesiredState, Process
+from rosrm.core.master.state.spec_changes import IN_PLACE, changed_fields, with_in_place
 from rosrm.model.applications import Action
 from rosrm.model.values import ProcessSpec
-
-#: Fields that only the master reads, and `restart`, whose change a slave can apply to a running
-#: instance. A change of any other field takes effect with the next start, except that of `limits`
-#: where the host can change them. (Of `array` only the number of jobs at a time changes: the index
-#: is part of the name.)
-IN_PLACE: Final = frozenset(
-    {
-        "restart", "needs", "required_labels", "preferred_labels", "avoided_labels", "priority",
-        "migration", "neighbours", "talks_to", "reschedule", "protect", "time_limit",
-        "start_order", "group", "together", "array",
-    }
-)  # fmt: skip
-_in_place_of: Final = attrgetter(*sorted(IN_PLACE))
-_FIELDS: Final = tuple(one.name for one in fields(ProcessSpec) if one.compare)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +62,7 @@ def difference_of(
         return Difference(Action.START)
     if process.phase.is_terminal or process.wanted is DesiredState.CANCEL:
         return _of_ended(process, spec)
-    current = process.next_spec or process.spec
-    changed = changed_fields(current, spec)
+    changed = changed_fields(state.spec_to_be(process), spec)
     if not changed:
         return None
     in_place = _needs_no_start(state, process, changed, spec)
@@ -96,13 +80,6 @@ def _of_ended(process: Process, spec: ProcessSpec) -> Difference | None:
     return Difference(Action.START, changed, f"it is {process.phase.value} now")
 
 
-def changed_fields(spec: ProcessSpec, other: ProcessSpec) -> tuple[str, ...]:
-    """Return the names of the fields in which two specs differ."""
-    if spec is other or spec == other:
-        return ()
-    return tuple(name for name in _FIELDS if getattr(spec, name) != getattr(other, name))
-
-
 def with_changes_in_place(
     state: MasterState, process: Process, desired: ProcessSpec
 ) -> ProcessSpec:
@@ -112,9 +89,7 @@ def with_changes_in_place(
         changed = changed_fields(spec, desired)
         if _needs_no_start(state, process, changed, desired):
             return desired
-    if _in_place_of(spec) == _in_place_of(desired):
-        return spec
-    return replace(spec, **{name: getattr(desired, name) for name in IN_PLACE})
+    return with_in_place(spec, desired)
 
 
 def _needs_no_start(

@@ -11,7 +11,6 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.answers import order_answered
 from rosrm.core.master.applications import amendments, rollout
 from rosrm.core.master.applications.deadlines import awaits_host
-from rosrm.core.master.applications.difference import changed_fields
 from rosrm.core.master.commands import Assign, Command, PublishStateConfig, SendOrder
 from rosrm.core.master.consequences import follow_up
 from rosrm.core.master.events import HandoffReported, OrderAnswered
@@ -21,6 +20,7 @@ from rosrm.core.master.migration.preemption import preempt
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.intents import Unjournaled
 from rosrm.core.master.state.process import WAITING, Process, ProcessPhase
+from rosrm.core.master.state.spec_changes import changed_fields
 from rosrm.model.applications import Action, PlannedAction
 from rosrm.model.orders import FenceInstance, StartInstance, StopInstance
 from rosrm.model.plan import HandoffPhase, ReportPhase
@@ -31,6 +31,8 @@ from rosrm.wording import size
 _ROUND: Final = 2.0
 #: Most rounds; each begins or ends a task, as long as one can be begun.
 _MOST_ROUNDS: Final = 10_000
+#: States of an instance that its host is starting.
+_STARTING: Final = (None, InstanceState.STARTING, InstanceState.RUNNING)
 #: Reports of the destination and the source of a handoff after each phase.
 _REPORTS: Final = {
     HandoffPhase.SHADOW: (ReportPhase.READY, ReportPhase.ATTACHED),
@@ -67,6 +69,7 @@ def plan(
         requested: names of the requested applications.
     """
     copy = copied(state)
+    _finish_orders(copy, now)
     change(copy)
     _run(copy, now)
     returns = tuple(_returns(state, copy))
@@ -100,9 +103,10 @@ def copied(state: MasterState) -> MasterState:
         state.chain_of, EMPTY,
     ]  # fmt: skip
     for process in state.processes.values():
-        shared += (process.spec, process.plain, process.decision, process.demand)
+        shared += (process.spec, process.next_spec, process.plain, process.decision, process.demand)
+        shared.append(process.left_behind)
     for instance in state.instances.values():
-        shared += (instance.id, instance.estimated)
+        shared += (instance.id, instance.spec, instance.estimated)
     for host in state.hosts.hosts:
         shared.append(host.description)
     for application in state.applications.values():
@@ -155,6 +159,19 @@ def _settle(state: MasterState, now: float) -> None:
         effects = [_carried_out(state, command, now) for command in state.take()]
         if not any(effects):
             return
+
+
+def _finish_orders(state: MasterState, now: float) -> None:
+    """Report the effect of the starts and stops that hosts carry out already."""
+    launched = {one for move in state.migrations.values() for one in move.launched}
+    for instance in list(state.instances.values()):
+        if state.hosts.why_unreachable(instance.host):
+            continue
+        is_sent = instance.id.process not in state.migrations or instance.id.number in launched
+        if instance.stopping:
+            _report(state, instance.host, instance.id, InstanceState.EXITED, now)
+        elif instance.state in _STARTING and is_sent:
+            _report(state, instance.host, instance.id, InstanceState.READY, now)
 
 
 def _carried_out(state: MasterState, command: Command, now: float) -> bool:
@@ -222,12 +239,12 @@ def _action(
     decision = new.decision if old is None or new.decision is not old.decision else None
     pending = _task_reason(after, new)
     waits = new.reason if new.phase in WAITING else pending
-    kind = _kind(old, new, was, becomes)
+    kind = _kind(before, old, new)
     if kind is None and not pending:
         return None
     return PlannedAction(
         new.name, kind or Action.REPLACE, new.spec.application, becomes, was,
-        reason=_refusable(before, old, new), fields=_changed(old, after, new), waits=waits,
+        reason=_refusable(before, old, new), fields=_changed(before, old, after, new), waits=waits,
         decision=None if decision is None else dict(decision),
     )  # fmt: skip
 
@@ -245,13 +262,15 @@ def _refusable(before: MasterState, old: Process | None, new: Process) -> str:
     return f"its host refuses a memory limit below the usage{usage}"
 
 
-def _changed(old: Process | None, after: MasterState, new: Process) -> tuple[str, ...]:
+def _changed(
+    before: MasterState, old: Process | None, after: MasterState, new: Process
+) -> tuple[str, ...]:
     """Return the fields in which the desired process differs from the one before."""
     if old is None or old.phase.is_terminal:
         return ()
     application = after.applications.get(new.spec.application)
     specs = application.specs if application is not None else {}
-    return changed_fields(old.spec, specs.get(new.name, new.spec))
+    return changed_fields(before.spec_to_be(old), specs.get(new.name, new.spec))
 
 
 def _task_reason(state: MasterState, process: Process) -> str:
@@ -265,14 +284,20 @@ def _host_of(state: MasterState, process: Process | None) -> str:
     return owner.host.name if owner is not None else ""
 
 
-def _kind(old: Process | None, new: Process, was: str, becomes: str) -> Action | None:
-    """Return the action between two states of one process; None: nothing was done."""
+def _kind(before: MasterState, old: Process | None, new: Process) -> Action | None:
+    """Return the action between two states of one process; None: nothing was done.
+
+    The end of a migration that was under way before is no action.
+    """
     if old is None or (old.phase.is_terminal and new.order != old.order):
         return None if new.phase is ProcessPhase.CANCELLED else Action.START
     if old.phase.is_terminal:
         return None
     if new.phase.is_terminal:
         return Action.STOP
-    if new.owner != old.owner:
-        return Action.REPLACE if new.spec != old.spec else Action.MOVE
-    return Action.CHANGE if new.spec != old.spec else None
+    changes = new.spec != before.spec_to_be(old)
+    migration = before.migrations.get(old.name)
+    arrived = migration is not None and new.owner == migration.destination.number
+    if new.owner != old.owner and not arrived:
+        return Action.REPLACE if changes else Action.MOVE
+    return Action.CHANGE if changes else None

@@ -69,16 +69,16 @@ def review(state: MasterState, now: float) -> None:
 def _review(state: MasterState, application: Application, now: float) -> None:
     version = application.version
     most = inf if version is None else version.rollout.max_parallel
-    replacing = sum(task.begun and task.replaces for task in application.tasks.values())
+    replacing = sum(_is_replaced(state, name, task) for name, task in application.tasks.items())
     for name, task in list(application.tasks.items()):
-        spec, was_begun = application.specs.get(name), task.begun
+        spec, was_replaced = application.specs.get(name), _is_replaced(state, name, task)
         if spec is None:
             done = _stop(state, application, name, now)
         else:
             task.awaits_host = False
             done = _advance(state, application, task, spec, now, may_replace=replacing < most)
             note_wait(state, application, task, spec, now)
-            replacing += task.replaces and task.begun and not was_begun
+            replacing += _is_replaced(state, name, task) and not was_replaced
         if done:
             _end(state, application, name)
         elif task.fault:
@@ -86,6 +86,13 @@ def _review(state: MasterState, application: Application, now: float) -> None:
             return  # the tasks may be others now
     if not application.tasks:
         _note_end(state, application, now)
+
+
+def _is_replaced(state: MasterState, name: str, task: Task) -> bool:
+    """Return True if a live process is being replaced, by this version or still by another one."""
+    process = state.processes.get(name)
+    by_other = process is not None and state.replacement_of(process) is not None
+    return by_other or (task.begun and task.replaces)
 
 
 def _end(state: MasterState, application: Application, name: str) -> None:
@@ -121,7 +128,7 @@ def _advance(
         task.reason = "waits until its former instance has ended"
         return False
     _change_in_place(state, process, spec, now)
-    if spec in (process.spec, process.next_spec):
+    if spec == state.spec_to_be(process):
         return process.next_spec is None and _runs_well(state, application, task, process, now)
     if task.begun and process.name not in state.migrations:
         task.fault = task.fault or "its new version did not start"
@@ -191,7 +198,7 @@ def _change_in_place(state: MasterState, process: Process, spec: ProcessSpec, no
     changed = with_changes_in_place(state, process, spec)
     if changed == before:
         return
-    state.set_spec(process, changed)
+    state.amend_spec(process, changed)
     if (changed.restart, changed.limits) != (before.restart, before.limits) and process.owner:
         pending = state.unamended.get(process.name)
         limits = changed.limits != before.limits or (pending is not None and pending.limits)
@@ -211,6 +218,9 @@ def _replace(
         state.enqueue(process, now)
     elif process.phase is ProcessPhase.SCHEDULED:
         change_between_runs(state, process, spec, now)
+    elif process.next_spec is not None:  # it is being stopped, to start with another spec
+        process.next_spec = spec
+        state.save(process)
     elif process.phase in _STARTED and process.wanted is DesiredState.RUN:
         cause = f"version {application.wanted} of {application.name}"
         refusal = try_replace(state, process, spec, cause, now)
@@ -232,7 +242,8 @@ def _runs_well(
     """Return True if a process with the desired spec has run well for long enough."""
     if not task.begun:  # it was only changed in place
         task.reason = "waits until its slave has changed it"
-        return process.name not in state.unamended
+        is_replaced = state.replacement_of(process) is not None
+        return not is_replaced and process.name not in state.unamended
     task.reason = process.reason or f"it is {process.phase.value}"
     run, is_running = (process.owner, process.restarts), process.phase is ProcessPhase.RUNNING
     task.awaits_host = awaits_host(state, process)
@@ -286,7 +297,8 @@ def want(state: MasterState, application: Application, number: int, now: float) 
     """
     same = number == application.wanted
     # The version before may be one that was not reached yet.
-    former = application.former if application.tasks or same else application.wanted
+    unreached = bool(application.tasks) and not application.returning
+    former = application.former if unreached or same else application.wanted
     unfinished = {} if application.paused else application.tasks
     _set_wanted(state, application, number, now, former=former if number else 0, tasks=unfinished)
 
@@ -309,12 +321,17 @@ def _set_wanted(
     ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]
     order = dict.fromkeys([one.name for one in dependants_first(state, ending)]) | found
     begun = {name: Task(replaces=found[name].action is Action.REPLACE) for name in order}
-    # Their specs do not differ, but their slaves have not changed them, or have refused it.
-    unamended = {name: Task() for name in application.tasks if name in state.unamended}
+    # Their specs do not differ, but their slaves have not changed them, or have refused it; or a
+    # replacement is being undone, and may still turn.
+    open_yet = {
+        name: Task() for name in application.specs
+        if (process := state.processes.get(name)) is not None
+        and (name in state.unamended or state.replacement_of(process) is not None)
+    }  # fmt: skip
     unchanged = application.specs.keys() - found.keys()
     live = {name for name in unchanged if not state.processes[name].phase.is_terminal}
     unfinished = {name: task for name, task in tasks.items() if same or name in live}
-    application.tasks = {**unamended, **begun, **unfinished}
+    application.tasks = {**open_yet, **begun, **unfinished}
     state.save_application(application)
     _review(state, application, now)
 

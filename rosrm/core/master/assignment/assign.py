@@ -361,7 +361,7 @@ def _take_place(
     host = state.hosts.hosts[column]
     instance = state.new_instance_id(process)
     state.queue.remove(process.name)
-    state.reserve(instance, host, now, ranking)
+    state.reserve(instance, process.spec, host, now, ranking)
     ranking.note_assignment()
     process.owner, process.left_behind, process.exit_code = instance.number, None, None
     process.queue_delay = 0.0

@@ -146,7 +146,7 @@ class _Search:
         queued = process.name in state.queue  # else it is set aside
         if queued:
             state.queue.remove(process.name)
-        state.add_instance(instance, host, 0.0, demand, devices=devices)
+        state.add_instance(instance, process.spec, host, 0.0, demand, devices=devices)
         process.owner = instance.number
         try:
             yield

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import Instance
 from rosrm.model.records import Intent
-from rosrm.model.values import InstanceState, InstanceStatus, ProcessSpec, is_plausible
+from rosrm.model.values import InstanceState, InstanceStatus, is_plausible
 
 #: Shortest run, in seconds, that shows the CPU use of a program; before, start-up dominates.
 _TELLING_RUN: Final = 1.0
@@ -25,24 +23,9 @@ def review_reservation(state: MasterState, instance: Instance, now: float) -> No
 
 def settle_reservation(state: MasterState, instance: Instance, now: float) -> None:
     """Lower the reservation of an instance to the part that the readings do not show yet."""
-    table, host = state.hosts, instance.host
     instance.settled = instance.settled or now - instance.since >= state.settings.settle
     instance.shown = _is_shown(instance, now, state.settings.settle)
-    ended = instance.estimated if instance.settled else frozenset()
-    if instance.shown:
-        ended |= host.shared
-    left = {}
-    for resource, amount in instance.demand.items():
-        shown = instance.seen.get(resource, 0.0) if resource in host.attributed else 0.0
-        if amount > shown and resource not in ended:
-            left[resource] = amount - shown
-    fractions = table.fractions_of(host, left, instance.estimated)
-    reserved = np.where(fractions < np.inf, fractions, 0.0)
-    change = reserved.copy()
-    change[: len(instance.reserved)] -= instance.reserved
-    if np.any(change):
-        instance.reserved = reserved
-        table.add_reservation(host, change)
+    state.reserve_rest(instance)
 
 
 def _is_shown(instance: Instance, now: float, settle: float) -> bool:
@@ -50,9 +33,7 @@ def _is_shown(instance: Instance, now: float, settle: float) -> bool:
     return instance.state is InstanceState.READY and now - instance.ready_at >= settle
 
 
-def learn_from(
-    state: MasterState, spec: ProcessSpec, instance: Instance, status: InstanceStatus
-) -> None:
+def learn_from(state: MasterState, instance: Instance, status: InstanceStatus) -> None:
     """Learn the needs of a program from the resources that a run used."""
     if status.state is InstanceState.REFUSED:
         return
@@ -62,6 +43,6 @@ def learn_from(
         "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
     }
     plausible = {name: used for name, used in peaks.items() if is_plausible(name, used)}
-    counts = state.learned.learn(spec.program, plausible)
+    counts = state.learned.learn(instance.spec.program, plausible)
     if counts is not None:
-        state.emit(Intent("learned", spec.program, counts))
+        state.emit(Intent("learned", instance.spec.program, counts))

@@ -187,7 +187,8 @@ def _begin(
         return Rejected(lacking)
     state.migrations[process.name] = migration
     if ranking is not None:
-        state.reserve(migration.destination, migration.destination_host, now, ranking)
+        host = migration.destination_host
+        state.reserve(migration.destination, process.spec, host, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, migration.progress_text)
     state.record(
         now, _BEGUN[aim], f"{process.name}: {migration.progress_text}; {cause}",

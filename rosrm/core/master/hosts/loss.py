@@ -104,12 +104,12 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
         return True
     if process.owner == instance.id.number and failover.is_ready(state, process):
         return True
-    policy = process.spec.host_loss
+    policy = instance.spec.host_loss
     lost_for = now - instance.host.lost_since
     if process.wanted is DesiredState.CANCEL:
         # Giving the instance up frees its name, so it must have ended. Only an expired fence
         # ensures that.
-        ends_at = max(policy.delay, ended_after_loss(process.spec, state.settings))
+        ends_at = max(policy.delay, ended_after_loss(instance.spec, state.settings))
         return policy.then == "elsewhere" and lost_for >= ends_at
     return policy.then in ("elsewhere", "stop") and lost_for >= policy.delay
 
@@ -133,14 +133,14 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
     )  # fmt: skip
     if process is not None and _may_be_readopted(process, instance):
         process.left_behind = LeftBehind(
-            instance.id.number, host.name, instance.node_name, process.began
+            instance.id.number, host.name, instance.node_name, process.began, instance.spec
         )
-    stays = process is not None and process.spec.host_loss.then == "stop"
-    lifecycle.gone(state, instance, now, why, requeue=not stays)
+    requeue = instance.spec.host_loss.then != "stop"
+    lifecycle.gone(state, instance, now, why, requeue=requeue)
 
 
 def _may_be_readopted(process: Process, instance: Instance) -> bool:
     """Return True if the instance owns the name and was not ordered to stop."""
     is_owner = process.owner == instance.id.number
     to_run = process.wanted is DesiredState.RUN and not instance.stopping
-    return is_owner and to_run and process.spec.host_loss.then == "elsewhere"
+    return is_owner and to_run and instance.spec.host_loss.then == "elsewhere"

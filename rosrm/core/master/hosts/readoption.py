@@ -15,6 +15,7 @@ from rosrm.core.master.state.process import (
     Process,
     ProcessPhase,
 )
+from rosrm.core.master.state.spec_changes import with_in_place
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
@@ -43,8 +44,13 @@ def _readopt(
     state: MasterState, process: Process, left: LeftBehind, host: Host, now: float
 ) -> None:
     state.unqueue(process)
+    spec = process.spec if left.spec is None else with_in_place(left.spec, process.spec)
+    if spec != process.spec:
+        state.set_spec(process, spec)
+        if process.spec.application in state.applications:
+            state.applications[process.spec.application].reopen(process.name)
     again = InstanceId(process.name, left.number)
-    instance = state.add_instance(again, host, now, state.estimate(process.spec))
+    instance = state.add_instance(again, spec, host, now, state.estimate(spec))
     # Unlike a new assignment, the instance has a state. So it is dropped if the host does not
     # report it.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING

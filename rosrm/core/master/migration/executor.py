@@ -35,6 +35,7 @@ from rosrm.core.master.migration.steps import begin, outcome_of, title
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
 from rosrm.core.master.state.migration import End, Migration
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.core.master.state.spec_changes import with_in_place
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import (
     Aim,
@@ -249,10 +250,22 @@ def _go_forward(state: MasterState, migration: Migration, now: float) -> None:
     state.save_migration(migration)
 
 
+def _is_given_up(state: MasterState, migration: Migration) -> bool:
+    """Return True if a replacement is no longer desired, because the source has the version."""
+    process = state.processes[migration.process]
+    application = state.applications.get(process.spec.application)
+    if migration.spec is None or application is None:
+        return False
+    desired = application.specs.get(process.name)
+    return desired is not None and with_in_place(process.spec, desired) == desired
+
+
 def _undo_reason(state: MasterState, migration: Migration) -> str:
     """Return why a plan must be undone before its commit; "" if it need not."""
     if state.processes[migration.process].wanted is DesiredState.CANCEL:
         return f"a cancellation of {migration.process} was requested"
+    if _is_given_up(state, migration):
+        return f"its application is to have the version that {migration.source} has"
     end = migration.ended.get(migration.source.number)
     if end is None:
         return ""
@@ -334,7 +347,7 @@ def _note_not_replaced(state: MasterState, process: Process, migration: Migratio
     """Note why the new version of a process was not started in its place."""
     application = state.applications.get(process.spec.application)
     task = application.tasks.get(process.name) if application is not None else None
-    if application is not None and task is not None:
+    if application is not None and task is not None and task.begun:
         task.fault = migration.failure or "it was stopped"
         state.save_application(application)
 

@@ -60,14 +60,21 @@ _REPORTS: Final[Mapping[ReportPhase, str]] = {
 
 def publish(state: MasterState, migration: Migration, phase: HandoffPhase) -> None:
     """Publish the phase of a handoff to its source and destination."""
-    namespace = state.processes[migration.process].spec.namespace
     state.emit(
         PublishStateConfig(
             migration.process, phase, migration.source.number, migration.destination.number,
-            qualified_name(namespace, migration.source_node),
-            qualified_name(namespace, migration.destination_node),
+            _full_name(state, migration, migration.source, migration.source_node),
+            _full_name(state, migration, migration.destination, migration.destination_node),
         )
     )  # fmt: skip
+
+
+def _full_name(state: MasterState, migration: Migration, instance: InstanceId, node: str) -> str:
+    """Return the name of a node of the source or the destination, which may differ in versions."""
+    known = state.instances.get(instance.number)
+    former = state.processes[migration.process].spec
+    spec = migration.spec_of(instance, former) if known is None else known.spec
+    return qualified_name(spec.namespace, node)
 
 
 def close(state: MasterState, migration: Migration) -> None:
@@ -303,9 +310,9 @@ def timed_out(state: MasterState, migration: Migration, step: Configure, now: fl
 
 def _stop_silent_destination(state: MasterState, migration: Migration, now: float) -> None:
     """Stop a destination without an answer, because only its end proves that it is not active."""
-    stop = state.processes[migration.process].spec.stop
-    lifecycle.stop_instance(state, state.instances[migration.destination.number], now)
-    migration.deadline = now + stop.timeout
+    destination = state.instances[migration.destination.number]
+    lifecycle.stop_instance(state, destination, now)
+    migration.deadline = now + destination.spec.stop.timeout
     state.record(
         now, EventKind.DESTINATION_UNHEARD,
         f"{migration.destination} does not confirm the abort of the handoff: the master stops it",

@@ -75,7 +75,7 @@ def _begin(state: MasterState, process: Process, now: float) -> bool:
         _wait(state, process, f"it can have no standby: {why}", now)
         return False
     state.standbys[process.name] = migration
-    state.reserve(migration.destination, host, now, ranking)
+    state.reserve(migration.destination, process.spec, host, now, ranking)
     state.record(
         now, EventKind.STANDBY_BEGUN, f"the standby of {process.name} starts on {host.name}",
         process=process.name, host=host.name, facts={"number": migration.destination.number},

@@ -32,7 +32,8 @@ def begin_move(
     """Begin a planned migration, with a reservation by a ranking on its destination."""
     destination, cause = migration.destination_host, migration.cause
     state.migrations[process.name] = migration
-    state.reserve(migration.destination, destination, now, ranking)
+    spec = migration.spec or process.spec
+    state.reserve(migration.destination, spec, destination, now, ranking)
     state.set_phase(process, ProcessPhase.MIGRATING, now, f"{migration.progress_text}: {cause}")
     how = f"by {migration.strategy}: {cause}"
     message = (

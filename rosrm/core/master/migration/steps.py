@@ -78,10 +78,11 @@ def _time_limit(state: MasterState, migration: Migration, step: Step) -> float:
     A start may fetch the artifacts of its process first. The start of a restored instance may not,
     because its source is frozen.
     """
-    fetches = isinstance(step, Start) and not step.restored
-    return max(step.timeout, 0.0) + (
-        state.processes[migration.process].spec.fetch_time if fetches else 0.0
-    )
+    limit = max(step.timeout, 0.0)
+    if isinstance(step, Start) and not step.restored:
+        spec = state.processes[migration.process].spec
+        limit += migration.spec_of(step.instance, spec).fetch_time
+    return limit
 
 
 def _is_expected(state: MasterState, migration: Migration, step: Step) -> bool:
@@ -180,7 +181,7 @@ def _start(state: MasterState, migration: Migration, step: Start, now: float) ->
         host, needs = state.hosts.by_name[step.host], state.estimate(spec)
         state.release_ended(process.name, host)
         devices = migration.source_devices if host is migration.source_host else ()
-        state.add_instance(step.instance, host, now, needs, devices=devices)
+        state.add_instance(step.instance, spec, host, now, needs, devices=devices)
         state.save(process)
     instance = state.instances.get(number)
     if instance is not None and instance.node_name != step.node_name:

@@ -128,12 +128,10 @@ def _switch(
 
     Args:
         cause: phrase for the record.
-        returns: the switch to another mode has failed; there is no mode to return to.
+        returns: the switch to another mode has failed.
     """
     modes, targets = state.modes, _targets(state, mode)
     message, actions = applications.execute(state, targets, by, now)
-    if mode.name != modes.wanted:
-        modes.former = "" if returns else modes.wanted
     modes.wanted, modes.switching, modes.began = mode.name, True, now
     names = [target.application for target in targets]
     modes.versions = {name: state.applications[name].wanted for name in names}
@@ -164,7 +162,7 @@ def _review_switch(state: MasterState, now: float) -> None:
     if fault:
         _handle_fault(state, mode, fault, now)
     elif not any(one.tasks for name in modes.versions if (one := state.applications.get(name))):
-        modes.switching, modes.former = False, ""
+        modes.switching, modes.reached = False, mode.name
         state.save_modes()
         text = f"the mode {mode.name} is in force"
         state.record(now, EventKind.MODE_REACHED, text, facts={"mode": mode.name})
@@ -210,10 +208,10 @@ def _handle_fault(state: MasterState, mode: Mode, fault: str, now: float) -> Non
     """Return to the former mode; without one, end the switch."""
     modes = state.modes
     modes.fault[mode.name] = fault
-    former = modes.known.get(modes.former)
+    former = modes.known.get(modes.reached) if modes.reached != mode.name else None
     facts = {"mode": mode.name}
     if former is None:
-        modes.switching, modes.former = False, ""
+        modes.switching = False
         state.save_modes()
         text = f"the mode {mode.name} is not reached: {fault}"
         state.record(now, EventKind.MODE_FAILED, text, facts=facts)
@@ -223,7 +221,7 @@ def _handle_fault(state: MasterState, mode: Mode, fault: str, now: float) -> Non
     try:
         _switch(state, former, "the other is not reached", OPERATOR, now, returns=True)
     except RequestRefused as refusal:
-        modes.switching, modes.former = False, ""
+        modes.switching = False
         state.save_modes()
         text = f"the mode {former.name} does not return: {refusal}"
         state.record(now, EventKind.MODE_FAILED, text, facts={"mode": former.name})

@@ -130,6 +130,7 @@ def _restore_instances(
     """Add the instances that may still run: owner, source, destination, and others to stop."""
     aliases, standby = item.get("node_names", {}), item.get("standby")
     given = item.get("devices", {})  # absent in older journals
+    specs = item.get("specs", {})  # absent in older journals
     moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}
     for number, host_name in item["instances"].items():
@@ -137,14 +138,15 @@ def _restore_instances(
         if host is None or number in ended:
             continue
         instance = InstanceId(process.name, int(number))
+        spec = from_plain(ProcessSpec, specs[number]) if number in specs else process.spec
         if instance.number == item["owner"] or instance.number in moving:
             devices = from_plain(tuple[HeldDevice, ...], given.get(number, []))
-            needs = state.estimate(process.spec)
-            held = state.add_instance(instance, host, now, needs, devices=devices)
+            needs = state.estimate(spec)
+            held = state.add_instance(instance, spec, host, now, needs, devices=devices)
             held.node_name = str(aliases.get(number, ""))
             held.settled = number == str(item["owner"]) and _has_run(state, process, now)
         else:
-            adopt_to_stop(state, instance, host, now)
+            adopt_to_stop(state, instance, spec, host, now)
     process.owner = item["owner"] if item["owner"] in process.instances else 0
 
 

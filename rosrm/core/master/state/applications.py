@@ -98,6 +98,11 @@ class Application:
         version = self.version
         return {} if version is None else version.specs
 
+    def reopen(self, name: str) -> None:
+        """Note that a process runs with another spec than the desired one, and is replaced."""
+        if name in self.specs:
+            self.tasks[name] = Task(replaces=True)
+
     def keep(self, number: int) -> list[int]:
         """Drop the oldest versions beyond a number; return the numbers of the dropped ones."""
         needed = {self.wanted, self.former, self.newest}

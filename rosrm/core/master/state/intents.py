@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple
 from operator import attrgetter
 from typing import Final, Protocol
 
@@ -81,8 +80,12 @@ def process_intent(tables: Tables, process: Process) -> Intent:
             "instances": {number: one.host.name for number, one in instances},
             "node_names": {number: one.node_name for number, one in instances if one.node_name},
             "devices": {number: to_plain(one.devices) for number, one in instances if one.devices},
+            "specs": {
+                number: to_plain(one.spec) for number, one in instances
+                if one.spec is not process.spec and one.spec != process.spec
+            },
             "standby": standby and migration_to_dict(standby, ()),
-            "left_behind": left and astuple(left),
+            "left_behind": left and to_plain(left),
             "image": process.image and to_plain(process.image),
             **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
             "excluded": dict(process.excluded),

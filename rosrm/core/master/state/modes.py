@@ -20,7 +20,8 @@ class Modes:
         known: by name, in the order of their file.
         loaded_by: operator that loaded them, on whose behalf a condition puts one into force.
         wanted: name of the mode in force, or that is being reached; "": none.
-        former: name of the mode to which a switch that fails returns; "": none.
+        reached: name of the mode that was in force last, to which a switch that fails returns; "":
+            none was.
         versions: application of the wanted mode to the number of its version, during a switch.
         switching: the applications of the wanted mode are not as desired yet.
         began: start of the switch by this master's clock; -inf: before this master started.
@@ -31,7 +32,7 @@ class Modes:
     known: dict[str, Mode] = field(default_factory=dict)
     loaded_by: Requester = Requester()  # noqa: RUF009 - immutable
     wanted: str = ""
-    former: str = ""
+    reached: str = ""
     versions: dict[str, int] = field(default_factory=dict)
     switching: bool = False
     began: float = -inf
@@ -45,7 +46,7 @@ class Modes:
 
 
 _JOURNALED: Final = (
-    "loaded_by", "wanted", "former", "versions", "switching", "fault", "met",
+    "loaded_by", "wanted", "reached", "versions", "switching", "fault", "met",
 )  # fmt: skip
 
 
@@ -63,6 +64,9 @@ def restored_modes(progress: Mapping[str, Any], known: Mapping[str, Mapping[str,
     """
     if not progress:
         return Modes()
+    if "former" in progress:  # in older journals
+        reached = progress["former"] or progress["wanted"]
+        progress = {"reached": reached, **progress}
     modes = Modes(**fields_from_plain(Modes, progress, _JOURNALED))
     modes.known = {name: from_plain(Mode, known[name]) for name in progress["order"]}
     return modes

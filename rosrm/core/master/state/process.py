@@ -74,6 +74,8 @@ class Instance:
     """One start of a process on one host, as the master sees it.
 
     Attributes:
+        spec: spec with which it was started, with the later changes that need no new start. That of
+            its process, if the instance owns the name.
         since: time of the assignment.
         demand: base units that the assignment reserved.
         estimated: resources whose amount is an estimate and stops counting after `settle`.
@@ -99,6 +101,7 @@ class Instance:
 
     id: InstanceId
     host: Host
+    spec: ProcessSpec
     since: float
     demand: Mapping[str, float]
     estimated: frozenset[str]
@@ -160,12 +163,14 @@ class LeftBehind:
 
     Attributes:
         began: unix time at which the process first started since it left the queue; 0: it did not.
+        spec: spec of the instance; None: that of its process, as in older journals.
     """
 
     number: int
     host: str
     node_name: str = ""
     began: float = 0.0
+    spec: ProcessSpec | None = None
 
 
 @dataclass(frozen=True, slots=True)
