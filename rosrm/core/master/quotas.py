@@ -1,10 +1,17 @@
-"""Quotas of users: limits on the processes that have not ended, and on their needs."""
+"""Quotas of users, and the limit of the cluster: on the processes that have not ended.
+
+Every request that starts or changes processes is checked here, against the whole that results.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from typing import Final
 
+import numpy as np
+
+from rosrm.core.master.applications.difference import difference_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.settings import DEFAULT_QUOTA
@@ -17,23 +24,35 @@ _UNITS: Final = {"memory": "B", "cpu": "core"}
 _ROUNDING: Final = 1e-9
 
 
-def check_quota(state: MasterState, specs: Iterable[ProcessSpec], by: Requester) -> None:
-    """Refuse processes that would together exceed the quota of their requester."""
+def check_quota(
+    state: MasterState, specs: Iterable[ProcessSpec], by: Requester, *,
+    superseded: AbstractSet[str] = frozenset(),
+) -> None:  # fmt: skip
+    """Refuse processes with which a user would have more than its quota.
+
+    The whole counts that the user would have then, as far as it is known: a process that is
+    replaced counts with the larger needs of both versions.
+
+    Args:
+        specs: new processes, and new versions of others.
+        by: their owner.
+        superseded: names of the applications whose desired versions the request replaces.
+    """
     quota = _quota_of(state, by)
     if not quota:
         return
-    live = (
-        process.spec
-        for process in state.processes.values()
-        if process.principal == by.name and not process.phase.is_terminal
-    )
-    in_use, requested = _usage(state, live), _usage(state, specs)
+    before = _usage(state, _claims(state, by.name, frozenset()).values())
+    claims = _claims(state, by.name, superseded)
+    for spec in specs:
+        claims.setdefault(spec.name, []).append(spec)
+    after = _usage(state, claims.values())
     exceeded = [
-        f"{resource}: {_text(resource, in_use[resource])} in use, "
-        f"{_text(resource, requested[resource])} more requested, {_text(resource, limit)} allowed"
+        f"{resource}: {_text(resource, before[resource])} in use, "
+        f"{_text(resource, after[resource] - before[resource])} more requested, "
+        f"{_text(resource, limit)} allowed"
         for resource, limit in quota.items()
         # Negated, because every comparison with NaN is false.
-        if not in_use[resource] + requested[resource] <= limit * (1.0 + _ROUNDING)
+        if not after[resource] <= max(before[resource], limit * (1.0 + _ROUNDING))
     ]
     if exceeded:
         raise RequestRefused(
@@ -44,6 +63,65 @@ def check_quota(state: MasterState, specs: Iterable[ProcessSpec], by: Requester)
         )
 
 
+def processes_fault(
+    state: MasterState, names: Iterable[str], *, superseded: AbstractSet[str] = frozenset()
+) -> str:
+    """Return why the cluster cannot have processes of these names, too; "": it can.
+
+    Args:
+        superseded: as in `check_quota`.
+    """
+    live, most = len(state.processes) - len(state.terminal), state.settings.max_processes
+    before = {spec.name for _, spec in _pending(state, frozenset())}
+    after = {*names, *(spec.name for _, spec in _pending(state, superseded))}
+    before, after = ({one for one in some if not _is_live(state, one)} for some in (before, after))
+    added = len(after) - len(before)
+    live += len(before)
+    if added <= 0 or live + added <= most:
+        return ""
+    return (
+        f"{live} processes have not ended, and {added} more would exceed "
+        f"`queue.max_processes` ({most})"
+    )
+
+
+def _is_live(state: MasterState, name: str) -> bool:
+    return name in state.processes and name not in state.terminal
+
+
+def _claims(
+    state: MasterState, owner: str, superseded: AbstractSet[str]
+) -> dict[str, list[ProcessSpec]]:
+    """Return the specs with which each process of a user runs, or is to run without a request."""
+    claims = {
+        name: [state.spec_to_be(process)]
+        for name, process in state.processes.items()
+        if process.principal == owner and not process.phase.is_terminal
+    }
+    for principal, spec in _pending(state, superseded):
+        if principal == owner:
+            claims.setdefault(spec.name, []).append(spec)
+    return claims
+
+
+def _pending(state: MasterState, superseded: AbstractSet[str]) -> Iterator[tuple[str, ProcessSpec]]:
+    """Yield the owner and the spec of each process that an application has yet to start or change.
+
+    That is also what it would do if its version failed, and the former one returned.
+    """
+    for application in state.applications.values():
+        is_superseded = application.name in superseded
+        if not is_superseded:
+            for name in application.tasks.keys() & application.specs.keys():
+                yield application.principal, application.specs[name]
+        if is_superseded or application.tasks:
+            number = application.reached if is_superseded else application.former
+            former = application.versions.get(number)
+            for name, spec in former.specs.items() if former is not None else ():
+                if difference_of(state, application.name, name, spec) is not None:
+                    yield application.principal, spec
+
+
 def _quota_of(state: MasterState, by: Requester) -> Mapping[str, float]:
     """Return the limits of a requester by resource; an operator has only those of its own entry."""
     quotas = state.settings.quotas
@@ -51,14 +129,17 @@ def _quota_of(state: MasterState, by: Requester) -> Mapping[str, float]:
     return {**default, **quotas.get(by.name, EMPTY)}
 
 
-def _usage(state: MasterState, specs: Iterable[ProcessSpec]) -> Mapping[str, float]:
-    """Return the number of processes, and the sums of their declared or estimated needs."""
+def _usage(state: MasterState, claims: Iterable[Sequence[ProcessSpec]]) -> Mapping[str, float]:
+    """Return the number of processes, and the sums of their declared or estimated needs.
+
+    `claims`: the specs that each process has or may have; the largest needs count.
+    """
     usage = {"processes": 0.0, "memory": 0.0, "cpu": 0.0}
-    for spec in specs:
-        needs = state.estimate(spec).amounts
+    for specs in claims:
+        needs = [state.estimate(spec).amounts for spec in specs]
         usage["processes"] += 1.0
-        for resource in _UNITS:
-            usage[resource] += needs.get(resource, 0.0)
+        for resource in _UNITS:  # unlike `max`, numpy keeps a NaN
+            usage[resource] += float(np.max([one.get(resource, 0.0) for one in needs]))
     return usage
 
 

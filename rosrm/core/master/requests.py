@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Set as AbstractSet
 from typing import Final
 
 from rosrm.core.master import events as happened
@@ -24,7 +25,7 @@ from rosrm.core.master.migration.rebalancing import begin_round, plan_round
 from rosrm.core.master.migration.start import why_busy, why_not_selected
 from rosrm.core.master.outcomes import Rejected, RequestRefused
 from rosrm.core.master.process_defaults import with_defaults
-from rosrm.core.master.quotas import check_quota
+from rosrm.core.master.quotas import check_quota, processes_fault
 from rosrm.core.master.rescheduling import allow_every_host
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.schedules import await_first_run, queue_again
@@ -32,7 +33,7 @@ from rosrm.core.master.scheduling.feasibility import unknown_resources
 from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
-from rosrm.core.master.stores import check_store, make_room
+from rosrm.core.master.stores import check_number, check_store, make_room
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import container_conflict, no_standby
@@ -68,7 +69,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     filled = [with_defaults(spec, state.settings.process_defaults) for spec in event.specs]
     specs = [spec for spec, _ in filled]
     fault = (
-        submission_fault(state, filled, len(filled))
+        submission_fault(state, filled)
         or neighbour_fault(state, specs, event.by.name)
         or start_order_fault(state, specs)
     )
@@ -194,18 +195,16 @@ def still_stopping(state: MasterState, name: str) -> str:
 
 
 def submission_fault(
-    state: MasterState, submitted: Sequence[tuple[ProcessSpec, tuple[str, ...]]], added: int
-) -> str:
+    state: MasterState, submitted: Sequence[tuple[ProcessSpec, tuple[str, ...]]],
+    superseded: AbstractSet[str] = frozenset(),
+) -> str:  # fmt: skip
     """Return why specs, each with the paths of its defaults, are refused; "": they are not.
 
-    `added`: number of those that are new processes.
+    `superseded`: as in `check_quota`.
     """
-    live, most = len(state.processes) - len(state.terminal), state.settings.max_processes
-    if live + added > most:
-        return (
-            f"{live} processes have not ended, and {added} more would exceed "
-            f"`queue.max_processes` ({most})"
-        )
+    fault = processes_fault(state, [spec.name for spec, _ in submitted], superseded=superseded)
+    if fault:
+        return fault
     for spec, defaulted in submitted:
         fault = _spec_fault(state, spec)
         if fault:
@@ -344,8 +343,13 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
             raise RequestRefused(f"{fault}. Nothing was restarted")
     ended = [one for one in processes if one.phase.is_terminal]
     fault = start_order_fault(state, [one.spec for one in ended])
+    fault = fault or processes_fault(state, [one.name for one in ended])
     if fault:
         raise RequestRefused(f"{fault}. Nothing was restarted")
+    for owner in dict.fromkeys(one.principal for one in ended):
+        own = [one for one in ended if one.principal == owner]
+        check_gangs(state, [one.spec for one in own], owner, may_join=True)
+        check_number(state, len(own), owner, is_operator=own[0].by_operator)
     check_quota(state, (one.spec for one in ended if one.principal == event.by.name), event.by)
     for process in processes:
         _restart(state, process, now, event.by)

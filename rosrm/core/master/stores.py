@@ -7,6 +7,7 @@ Only what still runs, waits or is desired can refuse a request.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from itertools import chain
 from typing import Final
 
 from rosrm.core.master.garbage import is_gone, remove_application, remove_process
@@ -30,18 +31,18 @@ MOST_OF_USER: Final = 0.8
 
 def check_store(
     state: MasterState, started: Sequence[ProcessSpec], owner: str, *, is_operator: bool,
-    version: Collection[ProcessSpec] = (),
+    versions: Sequence[Collection[ProcessSpec]] = (),
 ) -> None:  # fmt: skip
     """Refuse specs that would exceed the bound of their owner, whatever gives way to them.
 
     Args:
         started: specs of new processes.
-        version: those of a new version of an application.
+        versions: those of each new version of an application.
     """
-    _check_number(state, len(started), owner, is_operator=is_operator)
+    check_number(state, len(started), owner, is_operator=is_operator)
     bound, used = bound_of(Store.SPECS, is_operator=is_operator), state.ledger.of(owner)
-    size = used.size + sum(map(size_of, (*started, *version)))
-    number = used.number + len(started) + bool(version)
+    size = used.size + sum(map(size_of, (*started, *chain.from_iterable(versions))))
+    number = used.number + len(started) + len(versions)
     if number <= bound.number and size <= bound.size:
         return
     spare = [state.ledger.size_of(owner, key) for one in _spare(state, owner) for key in one]
@@ -71,7 +72,8 @@ def make_room(state: MasterState, owner: str, *, is_operator: bool) -> None:
             return
 
 
-def _check_number(state: MasterState, added: int, owner: str, *, is_operator: bool) -> None:
+def check_number(state: MasterState, added: int, owner: str, *, is_operator: bool) -> None:
+    """Refuse processes with which a user would have too large a share of all."""
     most = int(state.settings.max_processes * MOST_OF_USER)
     if is_operator or len(state.processes) - len(state.terminal) + added <= most:
         return

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.assignment.gang_search import MOST_MEMBERS
 from rosrm.core.master.commands import Reply
+from rosrm.core.master.state.process import ProcessPhase
+from rosrm.model.applications import RolloutPolicy, Target
+from rosrm.model.modes import Mode
 from rosrm.model.requester import Requester
-from rosrm.model.values import ProcessSpec
-from tests.unit.core.cluster import MIB, Cluster, job, process
+from rosrm.model.values import ProcessSpec, RestartPolicy
+from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, job, node, process
+from tests.unit.core.test_applications import row
 
 ADA, BOB = Requester("user:ada"), Requester("user:bob")
 ROOT = Requester("user:root", is_operator=True)
@@ -151,3 +157,119 @@ def test_no_user_has_more_than_its_quota(sizes: list[tuple[Requester, int, int]]
         for name, most in limits.items():
             own = [one for one in cluster.state.processes.values() if one.principal == name]
             assert sum(not one.phase.is_terminal for one in own) <= most
+
+
+# --- the resulting whole ----------------------------------------------------------------------
+
+MEMORY: Quotas = {"default": {"memory": 4 * GIB}}
+
+
+def target(name: str, *specs: ProcessSpec) -> Target:
+    parts = tuple(replace(spec, application=name) for spec in specs)
+    return Target(name, parts, 0, RolloutPolicy(healthy_for=1.0))
+
+
+def applied(cluster: Cluster, *targets: Target, plan: bool = False) -> Reply:
+    return cluster.ask(happened.ApplicationsRequested, targets, plan, ADA)
+
+
+@pytest.mark.parametrize("plan", [False, True])
+@pytest.mark.parametrize("command", [("run", "it"), ("new",)])
+def test_a_new_version_beyond_a_quota_is_refused(plan: bool, command: tuple[str, ...]) -> None:
+    """Whether its needs change in place or with a new start."""
+    cluster = Cluster("a", quotas=MEMORY)
+    assert applied(cluster, target("nav", process("p", 1024))).accepted
+    cluster.wait(2.0)
+    large = target("nav", process("p", 5 * 1024, command=command))
+    assert applied(cluster, large, plan=plan).code == "quota"
+    small = target("nav", process("p", 3 * 1024, command=command))
+    assert applied(cluster, small, plan=plan).accepted
+
+
+@pytest.mark.parametrize("plan", [False, True])
+def test_all_applications_of_a_request_count_together(plan: bool) -> None:
+    """Each of them alone would be within the quota."""
+    cluster = Cluster("a", quotas={"default": {"processes": 2}})
+    targets = [target(name, job(f"{name}1"), job(f"{name}2")) for name in "xyz"]
+    assert applied(cluster, *targets, plan=plan).code == "quota"
+    assert applied(cluster, targets[0], plan=plan).accepted
+
+
+def test_a_mode_beyond_a_quota_is_not_put_into_force() -> None:
+    """Its applications count together, too."""
+    cluster = Cluster("a", quotas={"user:ada": {"processes": 2}})
+    cluster.ask(happened.ModesLoaded, (Mode("m", (target("x", job("p"), job("q")),)),))
+    assert applied(cluster, target("x", job("p"))).accepted
+    assert submit(cluster, ADA, job("single")).accepted
+    assert cluster.ask(happened.ModeRequested, "m").code == "quota"
+
+
+def test_a_process_that_its_application_has_yet_to_start_counts() -> None:
+    """It waits until a former instance of its name has ended."""
+    cluster = Cluster(Machine("a", stubborn={"p"}), quotas={"default": {"processes": 1}})
+    assert applied(cluster, target("nav", process("p"))).accepted
+    cluster.wait(1.0)
+    cluster.state.set_phase(cluster["p"], ProcessPhase.FAILED, cluster.now)
+    cluster["p"].owner = 0
+    cluster.state.unowned_instances.clear()
+    assert applied(cluster, target("nav", process("p"))).accepted
+    assert row(cluster).pending
+    assert submit(cluster, ADA, job("more")).code == "quota"
+
+
+def test_the_version_to_which_a_failure_leads_back_counts() -> None:
+    """Otherwise its return would exceed the quota, and nothing could refuse it."""
+    cluster = Cluster("a", quotas=MEMORY)
+    applied(cluster, target("nav", process("p", 3 * 1024)))
+    cluster.wait(2.0)
+    applied(cluster, target("nav", process("p", 1024, command=("new",)), node("q")))
+    cluster.wait(2.0)
+    assert cluster["p"].spec.command == ("new",)
+    assert submit(cluster, ADA, job("more", 2 * 1024)).code == "quota"
+    cluster.discover("q")
+    cluster.wait(3.0)
+    assert submit(cluster, ADA, job("more", 2 * 1024)).accepted
+
+
+def test_a_request_that_raises_nothing_is_not_refused() -> None:
+    """Also where the quota is exceeded already, because an operator has lowered it."""
+    cluster = Cluster("a", quotas=MEMORY)
+    applied(cluster, target("nav", process("p", 3 * 1024), process("q", 512)))
+    cluster.wait(2.0)
+    object.__setattr__(cluster.settings, "quotas", {"default": {"memory": 1 * GIB}})
+    assert applied(cluster, target("nav", process("p", 2 * 1024))).accepted
+    cluster.wait(2.0)
+    assert applied(cluster, target("nav", process("p", 2.5 * 1024))).code == "quota"
+
+
+@pytest.mark.parametrize("again", ["restart", "apply"])
+def test_ended_processes_that_start_again_count_for_the_limit_of_the_cluster(again: str) -> None:
+    """As submitted ones do."""
+    cluster = Cluster("a", max_processes=2)
+    cluster.apply("nav", process("p", restart=RestartPolicy("never")))
+    cluster.wait(1.0)
+    cluster.finish("p", code=1)
+    cluster.wait(1.0)
+    cluster.submit(job("q"), job("r"))
+    reply = cluster.restart("p") if again == "restart" else cluster.apply("nav", process("p"))
+    assert not reply.accepted
+    assert "queue.max_processes" in reply.message
+
+
+def test_a_gang_is_bounded_as_a_whole() -> None:
+    """By a restart, by several applications, and by a change in place."""
+    many = [job(f"j{at}", together="g") for at in range(MOST_MEMBERS + 1)]
+    cluster = Cluster("a")
+    half = len(many) // 2
+    two = target("x", *many[:half]), target("y", *many[half:])
+    assert "at most" in applied(cluster, *two).message
+    singles = [job(one.name, 100 * 1024) for one in many]
+    assert applied(cluster, target("x", *singles)).accepted
+    assert "at most" in applied(cluster, target("x", *many)).message
+    cluster = Cluster("a")
+    for part in (many[:half], many[half:]):
+        assert submit(cluster, ADA, *part).accepted
+        for one in part:
+            cluster.finish(one.name)
+    restart = cluster.ask(happened.RestartRequested, tuple(one.name for one in many), ADA)
+    assert "at most" in restart.message

@@ -23,7 +23,7 @@ from rosrm.core.master.requests import count, submission_fault
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.applications import Application, Version
-from rosrm.core.master.state.process import DesiredState, Process
+from rosrm.core.master.state.process import WAITING, DesiredState, Process
 from rosrm.core.master.stores import check_store, make_room
 from rosrm.model.applications import Action, PlannedAction, Target
 from rosrm.model.event_kinds import EventKind
@@ -233,26 +233,35 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
         if difference.action is not Action.STOP
     ]
     specs = [spec for spec, _ in changed]
-    started = [
-        one.version.specs[name]
-        for one in prepared
-        if one.version is not None
-        for name, difference in one.found.items()
-        if difference.action is Action.START
-    ]
-    fault = submission_fault(state, changed, len(started)) or neighbour_fault(state, specs, by.name)
+    superseded = {one.application.name for one in prepared}
+    fault = submission_fault(state, changed, superseded) or neighbour_fault(state, specs, by.name)
     fault = fault or _start_order_fault(state, prepared)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
-    for one in prepared:  # an operator may apply the application of a user
-        owner = one.application.principal
-        own = [spec for spec in started if spec.application == one.application.name]
-        check_gangs(state, own, owner)
-        check_quota(state, own, by if owner == by.name else Requester(owner))
-        new = one.version is not None and one.number not in one.application.versions
-        version = one.version.specs.values() if one.version is not None and new else ()
-        operator = one.application.by_operator
-        check_store(state, own, owner, is_operator=operator, version=version)
+    action = {name: found.action for one in prepared for name, found in one.found.items()}
+    applications = {one.application.name: one.application for one in prepared}
+    for owner in _owners(prepared):  # an operator may apply those of a user
+        own = [spec for spec in specs if applications[spec.application].principal == owner.name]
+        new = [spec for spec in own if action[spec.name] is Action.START]
+        check_gangs(state, new, owner.name)
+        waiting = [
+            spec for spec in own
+            if (known := state.processes.get(spec.name)) is not None and known.phase in WAITING
+        ]  # fmt: skip
+        check_gangs(state, [*new, *waiting], owner.name, may_join=True)
+        check_quota(state, own, by if owner.name == by.name else owner, superseded=superseded)
+        versions = [
+            one.version.specs.values() for one in prepared
+            if one.application.principal == owner.name and one.version is not None
+            and one.number not in one.application.versions
+        ]  # fmt: skip
+        check_store(state, new, owner.name, is_operator=owner.is_operator, versions=versions)
+
+
+def _owners(prepared: Iterable[Prepared]) -> list[Requester]:
+    """Return the owners of the requested applications."""
+    found = {one.application.principal: one.application.by_operator for one in prepared}
+    return [Requester(name, is_operator=operator) for name, operator in found.items()]
 
 
 def _start_order_fault(state: MasterState, prepared: Iterable[Prepared]) -> str:

@@ -297,8 +297,7 @@ def want(state: MasterState, application: Application, number: int, now: float) 
     """
     same = number == application.wanted
     # The version before may be one that was not reached yet.
-    unreached = bool(application.tasks) and not application.returning
-    former = application.former if unreached or same else application.wanted
+    former = application.former if same else application.reached
     unfinished = {} if application.paused else application.tasks
     _set_wanted(state, application, number, now, former=former if number else 0, tasks=unfinished)
 

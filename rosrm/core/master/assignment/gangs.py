@@ -36,17 +36,22 @@ from rosrm.wording import listed, standing
 _JUDGED_FOR: Final = 1.0
 
 
-def check_gangs(state: MasterState, specs: Sequence[ProcessSpec], principal: str) -> None:
-    """Refuse a submission whose gang is too large, or has the name of one that has not started."""
+def check_gangs(
+    state: MasterState, specs: Sequence[ProcessSpec], principal: str, *, may_join: bool = False
+) -> None:
+    """Refuse processes whose gang is too large, or has the name of one that has not started.
+
+    `may_join`: the processes join a gang of that name.
+    """
     for name in dict.fromkeys(spec.together for spec in specs if spec.together):
-        many = sum(spec.together == name for spec in specs)
+        waiting = state.gangs.members.get((principal, name), ())
+        many = len({spec.name for spec in specs if spec.together == name}.union(waiting))
         if many > MOST_MEMBERS:
             raise RequestRefused(
                 f"the gang {name} has {many} processes; at most {MOST_MEMBERS} start together. "
                 f"Nothing was queued"
             )
-        waiting = state.gangs.members.get((principal, name))
-        if waiting:
+        if waiting and not may_join:
             raise RequestRefused(
                 f"a gang {name} waits already, and {listed(waiting)} of it "
                 f"{'has' if len(waiting) == 1 else 'have'} not started: cancel it, or choose "

@@ -2,6 +2,7 @@
 
 If no successor has started, the instance owns the name again, and its process leaves the queue; a
 job that has completed in between is complete. If a successor has started, the instance is fenced.
+An instance of another version than the desired one counts as that version, and is then replaced.
 """
 
 from __future__ import annotations
@@ -47,8 +48,10 @@ def _readopt(
     spec = process.spec if left.spec is None else with_in_place(left.spec, process.spec)
     if spec != process.spec:
         state.set_spec(process, spec)
-        if process.spec.application in state.applications:
-            state.applications[process.spec.application].reopen(process.name)
+        application = state.applications.get(spec.application)
+        if application is not None:
+            application.reopen(process.name)
+            state.save_application(application)
     again = InstanceId(process.name, left.number)
     instance = state.add_instance(again, spec, host, now, state.estimate(spec))
     # Unlike a new assignment, the instance has a state. So it is dropped if the host does not

@@ -98,6 +98,12 @@ class Application:
         version = self.version
         return {} if version is None else version.specs
 
+    @property
+    def reached(self) -> int:
+        """Return the number of the version to which a failure of another one would lead back."""
+        unreached = bool(self.tasks) and not self.returning
+        return self.former if unreached else self.wanted
+
     def reopen(self, name: str) -> None:
         """Note that a process runs with another spec than the desired one, and is replaced."""
         if name in self.specs:
