@@ -211,7 +211,6 @@ def test_a_process_that_its_application_has_yet_to_start_counts() -> None:
     cluster.wait(1.0)
     cluster.state.set_phase(cluster["p"], ProcessPhase.FAILED, cluster.now)
     cluster["p"].owner = 0
-    cluster.state.unowned_instances.clear()
     assert applied(cluster, target("nav", process("p"))).accepted
     assert row(cluster).pending
     assert submit(cluster, ADA, job("more")).code == "quota"
