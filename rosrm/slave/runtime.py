@@ -13,6 +13,7 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -56,6 +57,7 @@ from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import end_start, handle_signals
+from rosrm.runtime.path_calls import PathCalls
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.artifacts.service import ArtifactService
@@ -169,7 +171,9 @@ class SlaveRuntime:
             self._clients = InstanceClients(self._participant)
             self._lifecycle_clients = LifecycleClients(self._clients, self._take)
             self._prefixes = search_path(os.environ, sys.executable)
-            self._component_loads = ComponentLoads(self._clients, self._take, self._filled)
+            self._component_loads = ComponentLoads(
+                self._clients, self._take, self._filled, self._paths.run
+            )
             self._note_probes(first)
             self._note_broken(offered.broken)
             name = f"{self._participant.node.get_name()}_flows"
@@ -183,7 +187,7 @@ class SlaveRuntime:
             self._starter = Starter(
                 config, self._snapshots, self._state, self._supervisor, self._endpoint,
                 self._replication, self._artifacts, graph, sessions, launchers,
-                Lanes(self._post, PREPARE_LIMIT), take=self._take,
+                Lanes(self._post, PREPARE_LIMIT), self._paths, take=self._take,
                 instance_key=lambda one: security.instance_key(one.process, one.number),
             )  # fmt: skip
             self._ending = Shutdown(
@@ -213,6 +217,7 @@ class SlaveRuntime:
             self._config.state / "supervisor", self._config.logs, post=self._post, take=self._take,
             follow=self._follow_session,
             ended=lambda fault: self._ending.note_supervisor_left(fault),  # noqa: PLW0108 - made later
+            preparing=lambda: self._starter.preparing(),  # noqa: PLW0108 - as above
         )  # fmt: skip
         opened.callback(self._supervisor.close)
         if self._supervisor.unenforced:
@@ -222,6 +227,7 @@ class SlaveRuntime:
     def _join_ros(self, opened: contextlib.ExitStack) -> GraphWatch:
         """Create participant and endpoint; return the view of the ROS graph."""
         config = self._config
+        self._paths = PathCalls("paths of users", self._post)
         self._participant = Participant(config.ros, slave_node(config.host), pace="steady")
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
@@ -539,6 +545,7 @@ class SlaveRuntime:
 
     def _work(self, now: float) -> None:
         """Pass all queued events to the core, and execute its commands."""
+        self._paths.look()
         while self._from_threads:
             self._participant.guard.call(self._from_threads.popleft())
         while self._events:
@@ -582,11 +589,11 @@ class SlaveRuntime:
             self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
 
-    def _filled(self, container: InstanceId, component: Component) -> Component:
-        """Return a component with the values of its placeholders; raises `LaunchError`."""
-        return filled_component(
-            component, self._state.held.get(container), devices=self._devices.devices,
-            artifacts=self._artifacts.root, prefixes=self._prefixes,
+    def _filled(self, container: InstanceId, component: Component) -> Callable[[], Component]:
+        """Return a function that fills the placeholders of a component."""
+        return partial(
+            filled_component, component, self._state.held.get(container),
+            devices=self._devices.devices, artifacts=self._artifacts.root, prefixes=self._prefixes,
         )  # fmt: skip
 
     def _follow_session(self, status: InstanceStatus) -> None:

@@ -66,6 +66,7 @@ class SupervisorLink:
         post: schedules a call in the loop; may be called from any thread.
         take: takes events for the core.
         follow: takes each new status of an instance.
+        preparing: returns the statuses of instances whose orders are still to be sent.
         ended: called once, when there is no supervisor any more, with the fault; "": the supervisor
             ended as requested.
 
@@ -76,9 +77,10 @@ class SupervisorLink:
     def __init__(
         self, state: Path, logs: LogSettings, *, post: Callable[[Callable[[], None]], None],
         take: Callable[[events.Event], None], follow: Callable[[InstanceStatus], None],
-        ended: Callable[[str], None],
+        ended: Callable[[str], None], preparing: Callable[[], Sequence[InstanceStatus]] = tuple,
     ) -> None:  # fmt: skip
         self.state = state
+        self._preparing = preparing
         self._limits = LogLimits(logs.max_bytes, logs.keep, keep_bytes=logs.keep_bytes)
         self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
@@ -235,7 +237,7 @@ class SupervisorLink:
             self._follow(status)
         found = {one: from_memo(memo) for one, memo in client.memos.items()}
         memos = {one: memo for one, memo in found.items() if memo is not None}
-        statuses = [*client.instances, *self._launch_again(client)]
+        statuses = [*client.instances, *self._launch_again(client), *self._preparing()]
         replaced = events.SupervisorReplaced(
             tuple(statuses), memos, client.fenced, client.holds_starts
         )

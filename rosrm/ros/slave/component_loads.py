@@ -11,10 +11,13 @@ from rclpy.parameter import Parameter
 
 from rosrm.core.slave import events
 from rosrm.core.slave.commands import ListComponents, LoadComponent
-from rosrm.errors import LaunchError
 from rosrm.model.values import Component, InstanceId
 from rosrm.ros.slave.instance_clients import InstanceClients
 
+#: Calls a function in a thread, then one of two in the loop: with its result, or its exception.
+Run = Callable[
+    [Callable[[], Component], Callable[[Component], None], Callable[[Exception], None]], None
+]
 #: Seconds after which a request for a list counts as lost; the core repeats it.
 _PATIENCE: Final = 1.0
 _MISSING: Final = (
@@ -28,17 +31,19 @@ class ComponentLoads:
 
     Args:
         take: takes events for the core.
-        filled: returns a component of an instance with the values of its placeholders on this
-            host; raises `LaunchError`.
+        filled: returns a function that fills the placeholders of a component with values of this
+            host, which touches paths of users; that raises `LaunchError`.
+        run: as `PathCalls.run`.
     """
 
     def __init__(
         self, clients: InstanceClients, take: Callable[[events.Event], None],
-        filled: Callable[[InstanceId, Component], Component],
+        filled: Callable[[InstanceId, Component], Callable[[], Component]], run: Run,
     ) -> None:  # fmt: skip
         self._clients = clients
         self._take = take
         self._filled = filled
+        self._run = run
 
     def send(self, request: ListComponents | LoadComponent, now: float) -> None:
         """Send a request to a container; its answer becomes an event."""
@@ -79,22 +84,21 @@ class ComponentLoads:
 
     def _load(self, srv: Any, request: LoadComponent) -> None:
         """Order a container to load a component, however long its constructor takes."""
-        instance, pid, component = request.instance, request.pid, request.component
-        try:
-            filled = self._filled(instance, component)
-        except LaunchError as error:
-            self._take(events.ComponentLoaded(instance, pid, component, str(error)))
-            return
-        client = self._clients.get(instance, srv.LoadNode, f"{request.services}/load_node")
+        instance, component = request.instance, request.component
+
+        def loaded(fault: str) -> None:
+            self._take(events.ComponentLoaded(instance, request.pid, component, fault))
 
         def answered(response: Any) -> None:
-            if response is None:
-                return
-            unsaid = "the container gives no reason"
-            fault = "" if response.success else response.error_message or unsaid
-            self._take(events.ComponentLoaded(instance, pid, component, fault))
+            if response is not None:
+                unsaid = "the container gives no reason"
+                loaded("" if response.success else response.error_message or unsaid)
 
-        self._clients.call(client, load_request(srv, filled), inf, answered)
+        def order(filled: Component) -> None:
+            client = self._clients.get(instance, srv.LoadNode, f"{request.services}/load_node")
+            self._clients.call(client, load_request(srv, filled), inf, answered)
+
+        self._run(self._filled(instance, component), order, lambda fault: loaded(str(fault)))
 
 
 def load_request(srv: Any, component: Component) -> Any:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import LaunchError
+from rosrm.runtime.path_calls import at
 from rosrm.wording import get_close_matches, listed
 
 _PACKAGES = "share/ament_index/resource_index/packages"
@@ -43,6 +44,7 @@ def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> 
     """
     prefix = find_package(package, prefixes)
     path = prefix / "lib" / package / executable
+    at(path)
     if not path.is_file():
         near = _near(executable, _executables(path.parent))
         raise LaunchError(
@@ -57,6 +59,7 @@ def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> 
 def find_package(package: str, prefixes: Sequence[Path]) -> Path:
     """Return the prefix of a package; raises `LaunchError` with the searched places."""
     for prefix in prefixes:
+        at(prefix)
         if (prefix / _PACKAGES / package).is_file():
             return prefix
     where = ", ".join(str(prefix) for prefix in prefixes)
@@ -73,6 +76,7 @@ def _executables(folder: Path) -> list[str]:
 
 
 def _listed(folder: Path) -> list[str]:
+    at(folder)
     return sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
 
 

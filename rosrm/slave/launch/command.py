@@ -15,6 +15,7 @@ from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION, Adoption
 from rosrm.model.values import Assignment, ProcessSpec, RestartPolicy
+from rosrm.runtime.path_calls import at
 from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.artifacts import with_artifacts
 from rosrm.slave.launch.devices import with_devices
@@ -39,18 +40,17 @@ _RUN_PACKAGE: Final = (
 _SHORT: Final = _LONGEST // 16
 
 
-def launch_order(
+def plain_launch(
     assignment: Assignment, base_environment: Mapping[str, str], python: str, *,
-    where: ProcessLocation, state_directory: Path, launchers: Launchers, last_contact: float = 0.0,
-) -> LaunchOrder:  # fmt: skip
-    """Return the supervisor's order for an assignment, and write its parameters to a file.
+    where: ProcessLocation, state_directory: Path, launchers: Launchers,
+) -> Launch:  # fmt: skip
+    """Return the launch of an assignment without a launcher, and write its parameters to a file.
 
     Args:
         base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
         where: host and cluster of the instance.
         state_directory: of this host's supervisor; the parameters are beside the instance's log.
-        last_contact: of the master with this host, monotonic seconds; 0.0: now.
 
     Raises:
         LaunchError: the program was not found, with the searched places; or another error of the
@@ -68,8 +68,17 @@ def launch_order(
         arguments = _arguments(assignment, state_directory)
     except (OSError, ValueError) as error:  # a folder of another user, a text without encoding
         raise LaunchError(f"{assignment.instance}: {error}") from None
-    plain = Launch(assignment, where.cluster, (*command, *arguments), environment)
-    launch = launchers.prepare(plain)
+    return Launch(assignment, where.cluster, (*command, *arguments), environment)
+
+
+def order_of(plain: Launch, launchers: Launchers, host: str) -> LaunchOrder:
+    """Return the supervisor's order for a launch, as the launcher of its process changes it.
+
+    Raises:
+        LaunchError: the launcher fails, or this host cannot start the process.
+    """
+    launch, assignment = launchers.prepare(plain), plain.assignment
+    spec = assignment.spec
     _check_length(launch)
     return LaunchOrder(
         instance=assignment.instance,
@@ -81,10 +90,9 @@ def launch_order(
         restart=RestartPolicy("never") if assignment.on_trial else spec.restart,
         stop=spec.stop,
         fence=assignment.fence,
-        last_contact=last_contact,
         limits=limit_rule(spec),
         secrets=spec.secrets,
-        adoption=_adoption(spec.adoption, where.host),
+        adoption=_adoption(spec.adoption, host),
     )
 
 
@@ -174,6 +182,7 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
     if not text:
         return None
     path = log_path(state_directory, assignment.instance).with_suffix(".parameters.yaml")
+    at(path)
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         path.touch(0o600)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import stat
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +13,7 @@ from rosrm.config.parameter_files import parse_parameters
 from rosrm.errors import LaunchError
 from rosrm.model.parameters import merged_parameters
 from rosrm.model.values import ParameterSource, ProcessSpec, qualified_name
+from rosrm.runtime.path_calls import at
 
 #: Most bytes of a parameters file.
 _LARGEST: Final = 1 << 24
@@ -43,7 +46,12 @@ def _contents(spec: ProcessSpec) -> Iterator[ParameterSource]:
 
 
 def _read(path: Path) -> str:
-    with path.open("rb") as file:
+    at(path)
+    # Without O_NONBLOCK a FIFO without a writer would hold the thread.
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ValueError("it is no regular file")
         content = file.read(_LARGEST + 1)
     if len(content) > _LARGEST:
         raise ValueError(f"it has more than {_LARGEST} bytes")

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import sys
+import threading
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -15,15 +17,17 @@ from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.errors import LaunchError, describe_fault
+from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION
-from rosrm.model.values import Assignment, InstanceId, InstanceState
+from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
 from rosrm.ros.names import STATE_CONFIG, Names
 from rosrm.ros.slave.endpoint import SlaveEndpoint
 from rosrm.ros.slave.graph import GraphWatch
+from rosrm.runtime.path_calls import NoAnswer, PathCalls, at
 from rosrm.runtime.ros_wheels import without_bootstrapper
 from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.epoch import EPOCH_NOTE
-from rosrm.slave.launch.command import launch_order
+from rosrm.slave.launch.command import order_of, plain_launch
 from rosrm.slave.launch.environment import ProcessLocation, no_key
 from rosrm.slave.launch.lanes import Lanes
 from rosrm.slave.launch.launchers import Launchers
@@ -43,6 +47,51 @@ _CANNOT_ADOPT: Final = (
 _log = logging.getLogger("rosrm.slave")
 
 
+#: An assignment, and its order or why there is none.
+_Made = tuple[Assignment, Launch | LaunchOrder | LaunchError]
+
+
+class _Orders:
+    """Orders that a thread makes one after the other, and the loop takes.
+
+    Attributes:
+        current: the assignment that the thread is at; None: it has finished.
+    """
+
+    def __init__(
+        self, assignments: Sequence[Assignment], order: Callable[[Assignment], Launch | LaunchOrder]
+    ) -> None:
+        self.current: Assignment | None = None
+        self._left = deque(assignments)
+        self._made: list[_Made] = []
+        self._order = order
+        self._lock = threading.Lock()
+
+    def make(self) -> None:
+        """Make the orders that are left."""
+        while self._next():
+            assert self.current is not None
+            try:
+                made: _Made = self.current, self._order(self.current)
+            except (LaunchError, NoAnswer) as error:
+                made = self.current, LaunchError(str(error))
+            with self._lock:
+                self._made.append(made)
+
+    def _next(self) -> bool:
+        with self._lock:
+            self.current = self._left.popleft() if self._left else None
+            return self.current is not None
+
+    def take(self) -> tuple[list[_Made], list[Assignment]]:
+        """Take the orders made so far, and the assignments behind the current one."""
+        with self._lock:
+            taken = self._made, list(self._left)
+            self._made = []
+            self._left.clear()
+            return taken
+
+
 @dataclass
 class Starter:
     """Conversion of assignments into orders for the supervisor, after their files arrived.
@@ -51,6 +100,7 @@ class Starter:
         snapshots: directory of the snapshots.
         state: instances of the slave; read-only here.
         lanes: threads of the starts that ask a plugin, which may hang.
+        paths: threads for what touches paths of users.
         take: takes events for the core.
         instance_key: returns the key of an instance; None: with `security: none`.
     """
@@ -66,11 +116,12 @@ class Starter:
     sessions: SessionTable
     launchers: Launchers
     lanes: Lanes
+    paths: PathCalls
     take: Callable[[events.Event], None]
     instance_key: Callable[[InstanceId], bytes | None] = no_key
     _environment: Mapping[str, str] = field(init=False)
     _graph_before: dict[InstanceId, frozenset[bytes]] = field(init=False, default_factory=dict)
-    _launching: set[InstanceId] = field(init=False, default_factory=set)
+    _launching: dict[InstanceId, Assignment] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
     _warned_of: set[str] = field(init=False, default_factory=set)
 
@@ -94,8 +145,7 @@ class Starter:
         # Without this report the master would withdraw the assignment.
         waiting = [
             self.state.held[one.instance].status for one in wanted
-            if one.instance in self._launching
-            or (one not in ready and (one.snapshot_hosts or one.spec.artifacts))
+            if one not in ready and (one.snapshot_hosts or one.spec.artifacts)
         ]  # fmt: skip
         if waiting:
             self.endpoint.publish_statuses(waiting, complete=False)
@@ -123,7 +173,7 @@ class Starter:
         if not isinstance(command, commands.Restart):  # a restart needs nothing: the start follows
             self.artifacts.forget(command.instance)
             self.replication.forget(command.instance)
-            self._launching.discard(command.instance)
+            self._launching.pop(command.instance, None)
             refusal = "it was stopped before it was started"
             self.take(events.LaunchRefused(command.instance, refusal))
         return True
@@ -131,6 +181,7 @@ class Starter:
     def close(self) -> None:
         """Start no further instances."""
         self._closed = True
+        self._launching.clear()
 
     def has_begun(self, instance: InstanceId) -> bool:
         """Return True if the supervisor has or had the instance."""
@@ -142,6 +193,11 @@ class Starter:
             or self.artifacts.is_preparing(instance)
             or self.replication.is_preparing(instance)
         )
+
+    def preparing(self) -> list[InstanceStatus]:
+        """Return the statuses of the instances whose orders the supervisor does not have yet."""
+        held = self.state.held.items()
+        return [one.status for instance, one in held if self._is_preparing(instance)]
 
     def look_at_graph(self, awaited: Mapping[InstanceId, HeldInstance]) -> None:
         """Report the awaited nodes that are in the ROS graph now."""
@@ -177,28 +233,73 @@ class Starter:
         self.take(events.LaunchRefused(instance, reason))
 
     def _start(self, assignments: Sequence[Assignment], slots: int = 0) -> None:
-        orders = []
-        where = self._location()
+        """Have a thread make the orders, because they depend on paths that users name."""
         for assignment in assignments:
             held = self.state.held[assignment.instance]
             if held.awaited is not None:
                 before = self._seen_before(assignment, held.awaited.node_name)
                 self._graph_before[assignment.instance] = before
-            try:
-                self._check_supervisor(assignment)
-                self._check_secrets(assignment)
-                order = partial(
-                    launch_order, assignment, self._environment, sys.executable, where=where,
-                    state_directory=self.supervisor.state, launchers=self.launchers,
-                )  # fmt: skip
-                lane = _lane_of(assignment)
-                if lane:
-                    self._launching.add(assignment.instance)
-                    self.lanes.run(lane, order, partial(self._ordered, assignment, slots))
-                else:
-                    orders.append(self._completed(order(), slots))
-            except LaunchError as error:
-                self._refuse(assignment.instance, str(error))
+            self._launching[assignment.instance] = assignment
+        orders = _Orders(assignments, partial(self._order, where=self._location()))
+        take = partial(self._take_orders, orders, slots)
+
+        def late() -> None:
+            take()
+            self._report(orders.current)
+
+        def held_up(error: Exception) -> None:
+            take()
+            if orders.current is not None:
+                self._send([(orders.current, LaunchError(str(error)))], slots)
+
+        self.paths.run(orders.make, lambda _: take(), held_up, late=late)
+
+    def _report(self, *assignments: Assignment | None) -> None:
+        """Report starts that may take long, because the master would withdraw them otherwise."""
+        instances = [one.instance for one in assignments if one is not None]
+        waiting = [self.state.held[one].status for one in instances if one in self.state.held]
+        if waiting:
+            self.endpoint.publish_statuses(waiting, complete=False)
+
+    def _take_orders(self, orders: _Orders, slots: int) -> None:
+        """Send what has been made; make the orders behind a late one in another thread."""
+        made, left = orders.take()
+        self._send(made, slots)
+        wanted = [one for one in left if self._launching.get(one.instance) is one]
+        if wanted:
+            self._start(wanted, slots)
+
+    def _order(self, assignment: Assignment, where: ProcessLocation) -> Launch | LaunchOrder:
+        """Return the order of an assignment, or its launch if a plugin has to be asked.
+
+        Called in a thread. Raises `LaunchError`, or `NoAnswer`.
+        """
+        self._check_supervisor(assignment)
+        self._check_secrets(assignment)
+        launch = plain_launch(
+            assignment, self._environment, sys.executable, where=where,
+            state_directory=self.supervisor.state, launchers=self.launchers,
+        )  # fmt: skip
+        return launch if _lane_of(assignment) else order_of(launch, self.launchers, where.host)
+
+    def _send(self, made: Sequence[_Made], slots: int) -> None:
+        """Send the orders of instances that are still wanted, after their plugins were asked."""
+        orders = []
+        for assignment, order in made:
+            instance = assignment.instance
+            if self._launching.get(instance) is not assignment or instance not in self.state.held:
+                continue
+            if isinstance(order, Launch):
+                ask = partial(order_of, order, self.launchers, self.config.host)
+                done = partial(self._ordered, assignment, slots)
+                self.lanes.run(_lane_of(assignment), ask, done)
+                self._report(assignment)
+                continue
+            del self._launching[instance]
+            if isinstance(order, LaunchOrder):
+                orders.append(self._completed(order, slots))
+            else:
+                self._refuse(instance, str(order))
         if orders:
             self.supervisor.start(orders)
 
@@ -213,7 +314,7 @@ class Starter:
         instance = assignment.instance
         if instance not in self._launching:  # it was stopped
             return
-        self._launching.discard(instance)
+        del self._launching[instance]
         if isinstance(outcome, LaunchOrder):
             if self._is_wanted(assignment):
                 self.supervisor.start([self._completed(outcome, slots)])
@@ -244,6 +345,7 @@ class Starter:
                 "no secrets; it ends when all its processes have ended"
             )
         for path in secrets.values():
+            at(path)
             if path not in self._warned_of and is_exposed(path):
                 self._warned_of.add(path)
                 _log.warning(

@@ -13,7 +13,7 @@ from rosrm.errors import LaunchError
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec
 from rosrm.slave.devices import DeviceWatch
-from rosrm.slave.launch.command import launch_order
+from rosrm.slave.launch.command import order_of, plain_launch
 from rosrm.slave.launch.environment import ProcessLocation
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import from_memo, to_memo
@@ -145,10 +145,11 @@ def order(tmp_path: Path, held: tuple[HeldDevice, ...], *there: Device, base=Non
     fields = {"command": ("x",), "devices": tuple(DeviceNeed(one.kind) for one in held), **fields}
     spec, instance = ProcessSpec("p", **fields), InstanceId("p", 1)
     where = ProcessLocation("h", "c", "/s", devices=there)
-    return launch_order(
+    plain = plain_launch(
         Assignment(instance, spec, 1, "p", devices=held), base or {}, "python", where=where,
         state_directory=tmp_path, launchers=Launchers(),
     )  # fmt: skip
+    return order_of(plain, Launchers(), where.host)
 
 
 def test_environment_of_a_process_with_devices(tmp_path: Path) -> None:

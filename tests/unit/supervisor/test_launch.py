@@ -28,7 +28,7 @@ from rosrm.model.values import (
 )
 from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
-from rosrm.slave.launch.command import command_in_image, launch_order
+from rosrm.slave.launch.command import command_in_image, order_of, plain_launch
 from rosrm.slave.launch.environment import (
     ProcessLocation,
     process_environment,
@@ -59,10 +59,11 @@ def shadow() -> Assignment:
 
 def launched(tmp_path, given: Assignment, environment=None, python=sys.executable):
     """Return the launch order for an assignment."""
-    return launch_order(
+    plain = plain_launch(
         given, environment or {}, python, where=HERE, state_directory=tmp_path,
         launchers=Launchers(),
     )  # fmt: skip
+    return order_of(plain, Launchers(), HERE.host)
 
 
 def order(tmp_path, environment=None, **fields):
@@ -88,9 +89,10 @@ def test_programs_of_a_container_are_found_in_its_image(tmp_path):
         given = assignment(
             **{key: value}, arguments=("x",), container=Container("ros:jazzy", "podman")
         )
-        made = launch_order(
+        plain = plain_launch(
             given, {}, sys.executable, where=HERE, state_directory=tmp_path, launchers=launchers
         )
+        made = order_of(plain, launchers, HERE.host)
         assert made.argv == argv
 
 

@@ -1,0 +1,182 @@
+"""Calls on paths that users name, in threads: a path without an answer costs a loop nothing.
+
+On a file system that does not answer (a dead NFS server), an `open` or `stat` waits without a
+limit, and no signal ends it. So a loop hands such calls to a thread. The thread names each path
+before it touches the path (`at`). A call that is late keeps its thread, and the next calls get
+another one. After `PATIENCE` the loop is told that the path does not answer.
+
+The number of late calls is bounded. One dead mount does not use up this bound, because no further
+call touches a network file system on which a late call waits.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import Any, Final
+
+from rosrm.errors import RosrmError
+
+#: Seconds for a call.
+PATIENCE: Final = 10.0
+#: Seconds after which the calls behind another one get a thread of their own.
+LATE: Final = 0.2
+#: Most late calls.
+MOST_LATE: Final = 64
+#: Types of file systems that need another machine or program for an answer.
+_REMOTE: Final = (
+    "nfs", "cifs", "smb", "fuse", "9p", "ceph", "afs", "autofs", "glusterfs", "lustre", "virtiofs",
+)  # fmt: skip
+
+_this_thread = threading.local()
+
+
+class NoAnswer(RosrmError):
+    """A path does not answer."""
+
+
+def at(path: str | os.PathLike[str]) -> None:
+    """Note the path that this thread is about to touch; outside of a `PathCalls` do nothing.
+
+    Raises:
+        NoAnswer: it is on a network file system that does not answer to another call.
+    """
+    call = getattr(_this_thread, "call", None)
+    if call is not None:
+        call.reach(str(Path(path).absolute()))
+
+
+class _Call:
+    """A call, and the path that it is at."""
+
+    def __init__(
+        self, work: Callable[[], Any], then: Callable[[Any], None],
+        failed: Callable[[Exception], None], late: Callable[[], None],
+        others: Callable[[], list[_Call]],
+    ) -> None:  # fmt: skip
+        self.work, self.then, self.failed, self.late = work, then, failed, late
+        self._others = others
+        self.path = ""
+        self.began = 0.0
+        self.is_over = False
+
+    def reach(self, path: str) -> None:
+        others = [one for one in self._others() if one is not self]
+        mount = _remote_mount(path) if others else ""
+        if mount and any(_remote_mount(one.path) == mount for one in others):
+            raise NoAnswer(f"{path} does not answer, nor does any other path on {mount}")
+        self.path = path
+
+
+class _Lane:
+    """A thread, its current call, and the calls behind it."""
+
+    def __init__(
+        self, name: str, clock: Callable[[], float], finish: Callable[[_Call, Any], None]
+    ) -> None:
+        self.calls: SimpleQueue[_Call | None] = SimpleQueue()
+        self.current: _Call | None = None
+        self._clock, self._finish = clock, finish
+        threading.Thread(target=self._work, name=name, daemon=True).start()
+
+    def _work(self) -> None:
+        while (call := self.calls.get()) is not None:
+            call.began = self._clock()
+            self.current = _this_thread.call = call
+            try:
+                outcome = partial(call.then, call.work())
+            except Exception as error:  # noqa: BLE001 - the loop handles it, and the thread lives on
+                outcome = partial(call.failed, error)
+            self.current = None
+            self._finish(call, outcome)
+
+
+class PathCalls:
+    """Threads for calls on paths that users name; the first one begins with the first call.
+
+    Args:
+        name: of the threads.
+        post: schedules a call in the loop; may be called from any thread.
+        clock: monotonic seconds.
+    """
+
+    def __init__(
+        self, name: str, post: Callable[[Callable[[], None]], None], *,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:  # fmt: skip
+        self._name, self._post, self._clock = name, post, clock
+        self._lane: _Lane | None = None
+        self._late: list[_Lane] = []
+
+    def run(
+        self, work: Callable[[], Any], then: Callable[[Any], None],
+        failed: Callable[[Exception], None], late: Callable[[], None] = lambda: None,
+    ) -> None:  # fmt: skip
+        """Call `work` in a thread, then in the loop `then` with its result.
+
+        If `work` raises, or is not over in time (`NoAnswer`), `failed` is called in the loop with
+        the exception. Before that, `late` is called in the loop if the call takes a while.
+        """
+        self._put(_Call(work, then, failed, late, self._late_calls))
+
+    def look(self) -> None:
+        """Find the calls that are late; the loop calls this several times a second."""
+        now = self._clock()
+        lane = self._lane
+        call = None if lane is None else lane.current
+        if lane is not None and call is not None and now - call.began > LATE:
+            self._late.append(lane)
+            self._lane = None
+            for behind in _taken(lane.calls):
+                self._put(behind)
+            lane.calls.put(None)
+            call.late()
+        self._late = [one for one in self._late if one.current is not None]
+        for call in self._late_calls():
+            if not call.is_over and now - call.began > PATIENCE:
+                call.is_over = True
+                call.failed(NoAnswer(f"{call.path or 'it'} does not answer ({PATIENCE:g} s)"))
+
+    def _put(self, call: _Call) -> None:
+        if len(self._late) >= MOST_LATE:
+            paths = sorted({one.path for one in self._late_calls()})[:3]
+            fault = NoAnswer(f"{MOST_LATE} calls wait for paths without an answer, e.g. {paths}")
+            self._post(partial(call.failed, fault))
+            return
+        if self._lane is None:
+            self._lane = _Lane(self._name, self._clock, self._finish)
+        self._lane.calls.put(call)
+
+    def _late_calls(self) -> list[_Call]:
+        return [call for lane in tuple(self._late) if (call := lane.current) is not None]
+
+    def _finish(self, call: _Call, outcome: Callable[[], None]) -> None:
+        """Return an outcome to the loop, in the thread of the call."""
+        self._post(lambda: None if call.is_over else outcome())
+
+
+def _taken(calls: SimpleQueue[_Call | None]) -> list[_Call]:
+    taken: list[_Call] = []
+    while True:
+        try:
+            call = calls.get_nowait()
+        except Empty:
+            return taken
+        if call is not None:
+            taken.append(call)
+
+
+def _remote_mount(path: str) -> str:
+    """Return the mount point of a path, without touching it; "": it needs no other machine."""
+    longest, kind = "", ""
+    for line in Path("/proc/self/mountinfo").read_text(encoding="utf-8").splitlines():
+        mounted, _, about = line.partition(" - ")
+        point = mounted.split(" ")[4].encode().decode("unicode_escape")
+        if len(point) >= len(longest) and (path + "/").startswith(point.rstrip("/") + "/"):
+            longest, kind = point, about.split(" ")[0]
+    return longest if kind.startswith(_REMOTE) else ""
