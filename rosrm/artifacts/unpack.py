@@ -45,12 +45,17 @@ def unpack(archive: Path, directory: Path) -> None:
     """
     import tarfile  # noqa: PLC0415 - the slave, whose memory is budgeted, seldom needs it
 
+    from rosrm.artifacts.tar_entries import BoundedEntry  # noqa: PLC0415 - the same
+
     directory.mkdir(mode=0o700)
     links: list[TarInfo] = []
     directories: list[str] = []
     try:
-        with tarfile.open(archive, "r:") as tar:
-            for count, entry in enumerate(tar, 1):
+        with tarfile.open(archive, "r:", tarinfo=BoundedEntry) as tar:
+            count = 0
+            while (entry := tar.next()) is not None:
+                tar.members.clear()  # type: ignore[attr-defined]  # it keeps each entry with its headers
+                count += 1
                 if count > MOST_ENTRIES:
                     raise TransferError(f"it has more than {MOST_ENTRIES} entries")
                 _check(entry)
@@ -62,7 +67,9 @@ def unpack(archive: Path, directory: Path) -> None:
                     directories.append(entry.name)
                 else:
                     _write(tar, entry, path)
-    except (tarfile.TarError, ValueError, FileExistsError, FileNotFoundError) as error:
+    except (
+        tarfile.TarError, ValueError, FileExistsError, FileNotFoundError, RecursionError,
+    ) as error:  # fmt: skip
         raise TransferError(f"it is no sound archive: {error}") from None
     # Links come last, so that no file is written through one.
     for entry in links:

@@ -6,6 +6,7 @@ import io
 import os
 import socket
 import tarfile
+import tracemalloc
 
 import pytest
 
@@ -204,3 +205,79 @@ def test_a_change_of_unpacked_contents_is_noticed(source, saved, tmp_path):
     data.write_bytes(b"other")
     data.chmod(0o444)
     assert not is_intact(tmp_path / "new")
+
+
+LARGE = 100 * 2**20
+
+
+def peak_of_unpacking(path, directory) -> int:
+    """Return the most bytes that unpacking an archive takes, which is refused."""
+    tracemalloc.start()
+    try:
+        with pytest.raises(TransferError):
+            unpack(path, directory)
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME,
+        tarfile.GNUTYPE_LONGLINK,
+    ],
+)  # fmt: skip
+def test_a_long_header_is_refused_before_it_is_read(tmp_path, kind):
+    """A header of hundreds of megabytes would stay in the memory of each slave."""
+    path = tmp_path / "any.tar"
+    path.write_bytes(entry("content", kind, size=LARGE).tobuf(tarfile.GNU_FORMAT))
+    os.truncate(path, LARGE + 2048)
+    assert peak_of_unpacking(path, tmp_path / "new") < 2**20
+
+
+@pytest.mark.parametrize("version", ["1.0", "0.1", "0.0"])
+def test_the_map_of_a_sparse_file_is_not_read(tmp_path, version):
+    """Its length is that of the archive, and not that of a header."""
+    major, minor = version.split(".")
+    records = {"GNU.sparse.major": major, "GNU.sparse.minor": minor, "GNU.sparse.name": "content"}
+    if version == "0.1":
+        records = {"GNU.sparse.map": "0,1", "GNU.sparse.size": "1"}
+    if version == "0.0":
+        records = {"GNU.sparse.size": "1", "GNU.sparse.numblocks": "1"}
+    made = entry("content", size=LARGE, pax_headers=records)
+    path = tmp_path / "any.tar"
+    path.write_bytes(made.tobuf(tarfile.PAX_FORMAT) + b"99999999\n" + b"1\n" * 1000)
+    os.truncate(path, LARGE + 2048)
+    assert peak_of_unpacking(path, tmp_path / "new") < 2**20
+
+
+def test_the_blocks_of_an_old_sparse_header_are_not_read(tmp_path):
+    """Each one can announce another one."""
+    header = bytearray(entry("content", tarfile.GNUTYPE_SPARSE).tobuf(tarfile.GNU_FORMAT))
+    header[482] = 1
+    header[148:156] = b"%06o\0 " % (256 + sum(header[:148]) + sum(header[156:512]))
+    block = bytearray(512)
+    block[504] = 1
+    path = tmp_path / "any.tar"
+    path.write_bytes(bytes(header) + bytes(block) * 20_000)
+    assert peak_of_unpacking(path, tmp_path / "new") < 2**20
+
+
+def test_many_entries_with_long_headers_take_little_memory(tmp_path):
+    """Entries are not kept once they are unpacked."""
+    path = tmp_path / "any.tar"
+    with tarfile.open(path, "w", format=tarfile.PAX_FORMAT) as file:
+        for number in range(2000):
+            made = entry(f"content/{number}", pax_headers={"comment": "x" * 15_000})
+            file.addfile(made if number else entry("content", tarfile.DIRTYPE), io.BytesIO())
+        file.addfile(entry("other"), io.BytesIO())
+    assert peak_of_unpacking(path, tmp_path / "new") < 3 * 2**20
+
+
+def test_headers_that_only_announce_headers_are_refused(tmp_path):
+    """A chain of them ends with the archive."""
+    header = entry("content", tarfile.GNUTYPE_LONGNAME, size=1).tobuf(tarfile.GNU_FORMAT)
+    path = tmp_path / "any.tar"
+    path.write_bytes((header[:512] + b"x".ljust(512, b"\0")) * 20_000)
+    assert peak_of_unpacking(path, tmp_path / "new") < 20 * 2**20
