@@ -323,7 +323,7 @@ def _text_of(key: bytes) -> str:
 def _read(path: Path) -> dict[str, Any] | None:
     """Return the fields of a file that only its owner can read; None if it does not exist."""
     try:
-        descriptor, mode = open_own(str(path), os.O_RDONLY | os.O_NONBLOCK)
+        descriptor, mode = open_own(str(path), os.O_RDONLY)
     except FileNotFoundError:
         return None
     except OSError as error:

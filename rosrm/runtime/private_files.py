@@ -8,7 +8,9 @@ rosrm read or truncate any file of its user. The supervisor imports this module:
 from __future__ import annotations
 
 import errno
+import grp
 import os
+import pwd
 import stat
 from typing import Final
 
@@ -59,7 +61,8 @@ def make_safe_directory(directory: str | os.PathLike[str]) -> None:
 
     Raises:
         OSError: a part of the path cannot be created, belongs to another user than root, or is
-            writable for all users without the sticky bit; `strerror` says which.
+            writable for all users or a group of several without the sticky bit; `strerror` says
+            which.
     """
     path = os.path.abspath(directory)
     above = os.path.dirname(path)
@@ -75,10 +78,27 @@ def make_safe_directory(directory: str | os.PathLike[str]) -> None:
         make_safe_directory(os.path.realpath(path))
         return
     _check_directory(path, state)
-    if state.st_mode & stat.S_IWOTH and not state.st_mode & stat.S_ISVTX:
+    if state.st_mode & stat.S_ISVTX:
+        return
+    if state.st_mode & stat.S_IWOTH:
         raise _refusal(
             path, f"{path} is writable for all users, who could replace it (`chmod o-w {path}`)"
         )
+    if state.st_mode & stat.S_IWGRP and not _is_private_group(state):
+        raise _refusal(
+            path,
+            f"{path} is writable for the group {state.st_gid}, whose members could replace it "
+            f"(`chmod g-w {path}`)",
+        )
+
+
+def _is_private_group(state: os.stat_result) -> bool:
+    """Return True if only the owner of a directory is in its group, as Debian sets up each user."""
+    try:
+        group, owner = grp.getgrgid(state.st_gid), pwd.getpwuid(state.st_uid)
+    except KeyError:
+        return False
+    return group.gr_name == owner.pw_name and {*group.gr_mem} <= {owner.pw_name}
 
 
 def open_private(path: str, flags: int) -> int:
@@ -111,10 +131,14 @@ def open_own(path: str, flags: int) -> tuple[int, int]:
         OSError: it cannot be opened, is a link, or belongs to another user.
     """
     try:
-        file = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        # Without waiting: the path may have become a FIFO, which `_check_file` refuses.
+        kept = os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        file = os.open(path, flags | kept, 0o600)
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise _refusal(path, "it is a symbolic link") from None
+        if error.errno == errno.ENXIO:
+            raise _refusal(path, "it is no regular file") from None
         raise
     try:
         state = os.fstat(file)

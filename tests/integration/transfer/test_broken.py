@@ -8,6 +8,7 @@ import os
 import queue
 import random
 import signal
+import socket
 import tarfile
 import threading
 import time
@@ -199,3 +200,17 @@ def test_a_disk_that_becomes_full_during_the_transfer(sender, tmp_path, destinat
             with pytest.raises(TransferError, match=r"No space left on device; the file system"):
                 going.result(PATIENCE)
         assert [path.name for path in disk.place.iterdir()] == ["filler"]
+
+
+def test_silent_strangers_take_few_threads_and_no_place(
+    offer, source, target, sender, destination
+) -> None:
+    """Each connection without a reader has a thread; beyond a bound the oldest one ends."""
+    tasks = Path(f"/proc/{sender._process.pid}/task")
+    with contextlib.ExitStack() as closing:
+        for _ in range(200):
+            stranger = socket.create_connection(("127.0.0.1", offer.port), PATIENCE)
+            closing.enter_context(stranger)
+        destination.fetch(offer, target)
+        assert len(list(tasks.iterdir())) < 60
+    assert digests(target) == digests(source)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import grp
 import logging
 import os
+import pwd
 import stat
 from pathlib import Path
 
 import pytest
 
 from rosrm.errors import ConfigError
-from rosrm.runtime import private_files
+from rosrm.runtime import atomic_file, private_files
 from rosrm.runtime.private_files import (
     make_private_directory,
     make_private_file,
@@ -103,6 +105,42 @@ def test_a_directory_below_one_that_all_may_write_is_refused(tmp_path):
         make_private_directory(shared / "state")
     shared.chmod(0o1777)
     make_private_directory(shared / "state")
+
+
+@as_root
+def test_a_directory_below_one_that_a_group_may_write_is_refused(tmp_path):
+    """Another member of the group could replace it, as in a project folder with mode 2775."""
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    os.chown(shared, 0, 12_345)
+    shared.chmod(0o2775)
+    with pytest.raises(OSError, match=f"{shared} is writable for the group 12345.*chmod g-w"):
+        make_private_directory(shared / "state")
+    shared.chmod(0o3775)
+    make_private_directory(shared / "state")
+
+
+def test_the_group_of_one_user_is_no_other_user(tmp_path):
+    """Debian gives each user a group of its own, and an umask of 002 may go with it."""
+    own = pwd.getpwuid(os.geteuid())
+    group = grp.getgrgid(own.pw_gid)
+    if group.gr_name != own.pw_name or {*group.gr_mem} - {own.pw_name}:
+        pytest.skip("this user has no group of its own")
+    (tmp_path / "project").mkdir()
+    os.chown(tmp_path / "project", -1, own.pw_gid)
+    (tmp_path / "project").chmod(0o775)
+    make_private_directory(tmp_path / "project" / "state")
+
+
+@pytest.mark.parametrize("flags", [os.O_RDONLY, os.O_RDWR | os.O_CREAT, os.O_WRONLY | os.O_CREAT])
+def test_a_fifo_in_place_of_a_file_is_refused_at_once(tmp_path, flags):
+    """Opening it would wait for its other end."""
+    os.mkfifo(tmp_path / "file")
+    with pytest.raises(OSError, match="it is no regular file"):
+        open_private(str(tmp_path / "file"), flags)
+    os.mkfifo(tmp_path / "made.new")
+    with pytest.raises(OSError, match="it is no regular file"):
+        atomic_file.replace(str(tmp_path / "made"), b"x")
 
 
 @as_root

@@ -7,6 +7,7 @@ any time loses no notice, and repeats none in the file.
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 import threading
 from collections.abc import Mapping, Sequence
@@ -17,6 +18,7 @@ from typing import Final
 
 from rosrm.errors import RosrmError
 from rosrm.model.notices import Notice
+from rosrm.runtime.private_files import make_safe_directory, open_private
 from rosrm_alerts.watch import Key, Subject
 
 #: Most notices that wait for one sink; beyond that the oldest are dropped.
@@ -51,7 +53,9 @@ class Outbox:
         self._path, self._most = path, most
         self._lock = threading.Lock()
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
+            make_safe_directory(path.parent)
+            # SQLite gives its journal the mode of the file, which notices make private.
+            os.close(open_private(str(path), os.O_RDWR | os.O_CREAT))
             self._file = sqlite3.connect(path, check_same_thread=False, timeout=1.0)
             self._file.execute("PRAGMA locking_mode = EXCLUSIVE")
             self._file.executescript(_TABLES)
@@ -59,7 +63,8 @@ class Outbox:
                 self._file.execute("DELETE FROM position WHERE 0")
         except (OSError, sqlite3.Error) as fault:
             hint = "; is another `rosrm alerts run` using it?" if "locked" in str(fault) else ""
-            raise OutboxError(f"{path}: the outbox cannot be opened: {fault}{hint}") from fault
+            why = getattr(fault, "strerror", None) or fault
+            raise OutboxError(f"{path}: the outbox cannot be opened: {why}{hint}") from fault
 
     def position(self) -> int | None:
         """Return the sequence of the last event that was seen; None: there was none."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from rosrm.errors import ConfigError
+from rosrm.runtime import atomic_file
 from rosrm_report.extract import report_of
 from rosrm_report.model import Report
 from rosrm_report.page import page_of
@@ -24,13 +26,12 @@ def read_report(source: Path, title: str = "") -> Report:
 def write_page(report: Report, output: Path) -> None:
     """Write a report as HTML; a failure leaves an older file unchanged.
 
+    Only the user of the command may read the file, because it may have lines of logs.
+
     Raises:
         ConfigError: the file cannot be written.
     """
-    part = output.with_name(f"{output.name}.new")
     try:
-        part.write_text(page_of(report), encoding="utf-8")
-        part.replace(output)
+        os.close(atomic_file.replace(str(output), page_of(report).encode()))
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise ConfigError(f"--output {output}: cannot be written: {error.strerror}") from None

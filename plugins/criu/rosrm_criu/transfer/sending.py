@@ -14,7 +14,8 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Literal
 
@@ -27,6 +28,8 @@ from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Offer, OfferResult
 _LOOPBACK: Final = "127.0.0.1"
 #: Seconds for a reader to complete the TLS handshake and to send the token.
 _GREETING: Final = 10.0
+#: Most connections, each with a thread, whose reader is not admitted yet.
+_MOST_STRANGERS: Final = 16
 #: Seconds of unused time that may be made up at once.
 _SLACK: Final = 0.05
 #: Bytes of the line with the token, at most.
@@ -83,6 +86,8 @@ class _Server:
         self._listener = socket.create_server(("", 0))
         self._admitting = threading.Lock()
         self._reader: ssl.SSLSocket | None = None
+        #: Connections whose reader is not admitted yet; each has a thread.
+        self._strangers: deque[ssl.SSLSocket] = deque()
         self.token = secrets.token_urlsafe(32)
         self.port: int = self._listener.getsockname()[1]
         self.outcome: Literal["taken", "broken"] | None = None
@@ -108,11 +113,28 @@ class _Server:
                 plain, _ = self._listener.accept()
                 threading.Thread(target=self._converse, args=(plain,), daemon=True).start()
 
+    @contextlib.contextmanager
+    def _greeting(self, new: ssl.SSLSocket) -> Iterator[None]:
+        """Count a connection without an admitted reader; beyond the bound the oldest one ends."""
+        self._strangers.append(new)
+        with contextlib.suppress(OSError, IndexError):  # it has ended
+            if len(self._strangers) > _MOST_STRANGERS:
+                socket.socket.shutdown(self._strangers.popleft(), socket.SHUT_RDWR)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(ValueError):
+                self._strangers.remove(new)
+
     def _converse(self, plain: socket.socket) -> None:
         with plain, contextlib.suppress(OSError):  # a stranger's handshake may fail
             plain.settimeout(_GREETING)
-            with self._context.wrap_socket(plain, server_side=True) as connection:
-                refusal = self._refusal(connection)
+            with self._context.wrap_socket(
+                plain, server_side=True, do_handshake_on_connect=False
+            ) as connection:
+                with self._greeting(connection):
+                    connection.do_handshake()
+                    refusal = self._refusal(connection)
                 if refusal:
                     _say_fault(connection, refusal)
                     return
