@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import Refused
 from rosrm.model.artifacts import LARGEST_ARTIFACT, is_digest
 from rosrm.model.ledger import Store, bound_of
@@ -52,7 +52,7 @@ class ArtifactStore:
     """
 
     def __init__(
-        self, root: Path, max_size: int, clock: Callable[[], float] = time.monotonic
+        self, root: Path, max_size: int, clock: Callable[[], float] = clocks.boot_time
     ) -> None:
         self._root = root
         self._max_size = max_size

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.archive.retention import ArchiveLimits
 from rosrm.archive.writer import ArchiveWriter
 from rosrm.cli.output.plain import echo
@@ -92,9 +92,9 @@ class Collecting:
     def run(self, every: float) -> None:
         """Collect until the collector is to stop."""
         while not self._stop.is_set():
-            begun = time.monotonic()
+            begun = clocks.boot_time()
             wait = self._look(every)
-            self._stop.wait(max(0.0, begun + wait - time.monotonic()))
+            self._stop.wait(max(0.0, begun + wait - clocks.boot_time()))
         if self._master is not None:
             self._master.close()
 

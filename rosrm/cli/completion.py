@@ -11,11 +11,11 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from typing import TYPE_CHECKING, Final
 
 import typer
 
+from rosrm import clocks
 from rosrm.cli import early
 
 if TYPE_CHECKING:
@@ -72,10 +72,10 @@ def _asked(ctx: typer.Context) -> Listing:
     security = connecting.security_mode(given.get("cluster"))
     joined = early.take(settings)
     with connecting.connect(settings, timeout=LIMIT, security=security, joined=joined) as client:
-        deadline = time.monotonic() + LIMIT
+        deadline = clocks.boot_time() + LIMIT
 
         def check(_waited: float) -> None:
-            if time.monotonic() > deadline:
+            if clocks.boot_time() > deadline:
                 raise TimeoutError
 
         return client.list(processes=True, hosts=True, applications=True, on_wait=check)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 import typer
 
+from rosrm import clocks
 from rosrm.cli import early
 from rosrm.cli.options import CommonOptions
 from rosrm.cli.output.plain import echo
@@ -63,7 +63,7 @@ def print_trouble(snapshot: Listing) -> None:
 
 def connect(settings: RosSettings, security: SecurityMode | None = None) -> MasterClient:
     """Find the master within `REPORT_WITHIN` of the start, but for at least `SHORTEST_SEARCH`."""
-    timeout = max(SHORTEST_SEARCH, REPORT_WITHIN - (time.monotonic() - BEGUN))
+    timeout = max(SHORTEST_SEARCH, REPORT_WITHIN - (clocks.boot_time() - BEGUN))
     return connecting.connect(
         settings, timeout=timeout, security=security, joined=early.take(settings), begun=BEGUN
     )

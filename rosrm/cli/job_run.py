@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from types import FrameType
 from typing import Final
 
+from rosrm import clocks
 from rosrm.cli.connection import note
 from rosrm.cli.output.log_lines import LogStream, show
 from rosrm.cli.waiting import show_change
@@ -97,7 +98,7 @@ class _Job:
     signal: int = 0
     _reader: LogReader = field(init=False)
     _begun: bool = False
-    _since: float = field(default_factory=time.monotonic)
+    _since: float = field(default_factory=clocks.boot_time)
     _reported: set[str] = field(default_factory=set)
 
     def __post_init__(self) -> None:
@@ -166,7 +167,7 @@ class _Job:
 
     def _report(self, row: ProcessRow) -> None:
         """Report once why the job waits, and each state that needs the user's attention."""
-        if row.state in _WAITING and time.monotonic() - self._since > _PATIENCE:
+        if row.state in _WAITING and clocks.boot_time() - self._since > _PATIENCE:
             if "waits" not in self._reported:
                 self._reported.add("waits")
                 story = ask_until_answered(lambda _: self.client.explain(self.name), note)

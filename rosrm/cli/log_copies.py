@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from rosrm import clocks
 from rosrm.cli.options import seconds_of
 from rosrm.cli.output.log_lines import LogStream, Piece, show
 from rosrm.cli.output.plain import echo
@@ -40,7 +41,7 @@ def time_of(option: str, text: str) -> float:
         return datetime.fromisoformat(re.sub(r"[zZ]$", "+00:00", text)).timestamp()
     except (ValueError, OverflowError):
         hint = ". Give a time span up to now, e.g. 10min, or a time, e.g. 2026-11-27T09:30"
-        return time.time() - seconds_of(option, text, hint=hint)
+        return clocks.wall_time() - seconds_of(option, text, hint=hint)
 
 
 def copy_logs(

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from typing import Final
 
+from rosrm import clocks
+
 #: Monotonic start time of this process, from which the time-outs of a command count.
-BEGUN: Final = time.monotonic()
+BEGUN: Final = clocks.boot_time()
 
 #: Exit code of a program that Ctrl-C has ended, as in a shell.
 INTERRUPTED: Final = 130

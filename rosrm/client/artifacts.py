@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final, Protocol
 
+from rosrm import clocks
 from rosrm.artifacts.pack import Archive, changed
 from rosrm.client.retrying import Notify
 from rosrm.errors import Refused
@@ -77,7 +78,7 @@ def send_artifacts(
 
 
 def _send(master: _Master, source: str, archive: Archive, notify: Notify) -> None:
-    offset, notified, retries = _stored(master, archive), time.monotonic(), 0
+    offset, notified, retries = _stored(master, archive), clocks.boot_time(), 0
     while offset < archive.size:
         data = archive.part(offset, _PART)
         answered = _stored(master, archive, offset, data)
@@ -87,8 +88,8 @@ def _send(master: _Master, source: str, archive: Archive, notify: Notify) -> Non
             raise Refused("the master has lost what it had received; submit again", "changed")
         else:
             offset = _stored(master, archive)
-        if time.monotonic() - notified >= _NOTIFY_PERIOD:
-            notified = time.monotonic()
+        if clocks.boot_time() - notified >= _NOTIFY_PERIOD:
+            notified = clocks.boot_time()
             notify(f"sends {source} to the master: {sized(offset)} of {sized(archive.size)}")
 
 

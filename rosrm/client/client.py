@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
 
+from rosrm import clocks
 from rosrm.client.connecting import connect, ros_settings, row_of, security_mode
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.errors import Refused
@@ -376,7 +377,7 @@ class Client:
         while True:
             view = ask_until_answered(look, self._notify, deadline if follow else 0.0)
             yield from view.events
-            if not follow or time.monotonic() >= deadline:
+            if not follow or clocks.boot_time() >= deadline:
                 return
             after, newest = view.last_sequence, _ALL_NEW
             time.sleep(PERIOD)
@@ -405,7 +406,7 @@ class Client:
         selection = logs.LogSelection(tail, since, host, follow)
         (reader,) = self.log_readers([process], selection)
         yield from reader.read()
-        while follow and not reader.at_end and time.monotonic() < deadline:
+        while follow and not reader.at_end and clocks.boot_time() < deadline:
             chunk = reader.poll()
             if chunk is not None:
                 yield chunk

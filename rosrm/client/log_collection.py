@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import errno
 import threading
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.archive.layout import Source
 from rosrm.client.retrying import Notify
 from rosrm.client.waiting import ENDED
@@ -104,12 +104,12 @@ class LogCollector:
         for host, process in self._due():
             if self._stop.is_set():
                 break
-            if self._silent.get(host, 0.0) > time.monotonic():
+            if self._silent.get(host, 0.0) > clocks.boot_time():
                 continue
             try:
                 self._collect(master, host, process)
             except NoMaster as error:
-                self._silent[host] = time.monotonic() + _SILENT
+                self._silent[host] = clocks.boot_time() + _SILENT
                 self._say((host, ""), str(error))
                 self._take(self._list(master))  # raises if the master does not answer
             except Refused as refusal:
@@ -159,7 +159,7 @@ class LogCollector:
         log = self._logs.setdefault((row.host, row.name), _Log())
         if row.state not in ENDED:
             log.live = row.number
-            log.due = min(log.due, time.monotonic() + self._every * _QUIET)
+            log.due = min(log.due, clocks.boot_time() + self._every * _QUIET)
 
     def _note_event(self, event: EventRow) -> None:
         for host in (event.host, event.facts.get("from", "")):
@@ -169,7 +169,7 @@ class LogCollector:
 
     def _due(self) -> Iterator[tuple[str, str]]:
         """Yield host and process of each log that is due, the longest waiting first."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         due = sorted((log.due, at) for at, log in self._logs.items() if log.due <= now)
         return iter([at for _, at in due if at[0] in self._up])
 
@@ -205,7 +205,7 @@ class LogCollector:
         )
         is_complete = not log.live and log.complete.issuperset(newest)
         wait = 0.0 if stored >= TURN else log.wait
-        log.due = _NEVER if is_complete else time.monotonic() + wait
+        log.due = _NEVER if is_complete else clocks.boot_time() + wait
 
     def _store_new(self, master: MasterClient, source: Source, log: _Log) -> int:
         """Store new output of an instance, at most about `TURN` bytes; return their number."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeVar
 
+from rosrm import clocks
 from rosrm.errors import NoMaster
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ _SILENCE: Final = 2.0
 
 def deadline_after(timeout: float | None) -> float:
     """Return the monotonic time at which a time-out (s) passes; never, for None."""
-    return math.inf if timeout is None else time.monotonic() + timeout
+    return math.inf if timeout is None else clocks.boot_time() + timeout
 
 
 def ask_until_answered(
@@ -47,7 +48,7 @@ def ask_until_answered(
 
     def on_wait(seconds: float) -> None:
         nonlocal silent
-        if seconds >= _SILENCE and not silent and time.monotonic() < deadline:
+        if seconds >= _SILENCE and not silent and clocks.boot_time() < deadline:
             silent = True
             notify(f"the master has not answered for {seconds:.0f} s; still waiting")
 
@@ -55,7 +56,7 @@ def ask_until_answered(
         try:
             answer = look(on_wait)
         except NoMaster as error:
-            if time.monotonic() >= deadline:
+            if clocks.boot_time() >= deadline:
                 raise
             if not failed:
                 notify(f"{error} Asking again until the master answers")

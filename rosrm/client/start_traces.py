@@ -8,6 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.client.retrying import Notify, ask_until_answered, deadline_after
 from rosrm.client.waiting import ENDED, UNTIL_ASKED
 from rosrm.errors import Refused, RosrmError
@@ -116,10 +117,10 @@ def submit_traced(
 ) -> dict[str, Trace]:
     """Submit processes, and return the trace of each start by the name of its process."""
     deadline = deadline_after(timeout)
-    sent = time.time_ns()
+    sent = clocks.wall_time_ns()
     mark = {VARIABLE: f"client_sent={sent}"}
     master.submit([replace(one, environment={**one.environment, **mark}) for one in specs])
-    answered = time.time_ns()
+    answered = clocks.wall_time_ns()
     readers = [_Reader(master, spec.name, sent, deadline, notify) for spec in specs]
     return {one.process: {**one.read(), "client_answered": answered} for one in readers}
 
@@ -152,7 +153,7 @@ class _Reader:
             started = bool(stamps)
             # The supervisor writes the trace before it reports the pid.
             is_over = row.pid or row.state in ENDED | UNTIL_ASKED
-            if not started and (is_over or time.monotonic() >= self.deadline):
+            if not started and (is_over or clocks.boot_time() >= self.deadline):
                 why = f": {row.reason}" if row.reason else ""
                 raise RosrmError(
                     f"there is no trace of a start of {self.process}: it {standing(row.state)}{why}"

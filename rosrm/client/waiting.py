@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
+from rosrm import clocks
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.event_kinds import EventKind
@@ -109,7 +110,7 @@ def wait_for_processes(
         changes.report(row for row in ours if verdicts[row.name] != "done")
         awaited = [row for row in ours if verdicts[row.name] == "awaited"]
         stays = all(row.state == "set_aside" and row.since >= SETTLED for row in awaited)
-        if stays or time.monotonic() >= deadline:
+        if stays or clocks.boot_time() >= deadline:
             failed = [row.name for row in ours if verdicts[row.name] == "failed"]
             # A process that is no longer listed does not run: that is what "ended" awaits.
             gone = () if until == "ended" else [name for name in names if name not in rows]
@@ -178,7 +179,7 @@ def _watch(
             if row.pending and seen.get(row.name) != (row.version, row.pending):
                 on_change(row)
             seen[row.name] = row.version, row.pending
-        if is_done(view) or time.monotonic() >= deadline:
+        if is_done(view) or clocks.boot_time() >= deadline:
             return view
         time.sleep(PERIOD)
 
@@ -284,7 +285,7 @@ def _look_until(
     """Return the first result of `look` without pending names, or the last one in time."""
     deadline = deadline_after(timeout)
     while (result := ask_until_answered(look, notify, deadline)).pending:
-        if time.monotonic() >= deadline:
+        if clocks.boot_time() >= deadline:
             return replace(result, timed_out=True)
         time.sleep(PERIOD)
     return result

@@ -13,6 +13,7 @@ import time
 from contextlib import suppress
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.component import link
 
 #: Seconds in which the container must listen: it may have been started at the same time.
@@ -48,14 +49,14 @@ def main(arguments: list[str]) -> str:
 
 def _connected(container: str) -> socket.socket | None:
     """Return a connection to a container of this host; None: there is none."""
-    where, until = link.address(container, os.environ), time.monotonic() + _PATIENCE
+    where, until = link.address(container, os.environ), clocks.boot_time() + _PATIENCE
     while True:
         connection = socket.socket(socket.AF_UNIX)
         try:
             connection.connect(where)
         except OSError:
             connection.close()
-            if time.monotonic() >= until:
+            if clocks.boot_time() >= until:
                 return None
             time.sleep(_PAUSE)
         else:

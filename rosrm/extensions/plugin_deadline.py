@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Final, TypeVar
 
+from rosrm import clocks
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.extensions.guard import in_process
 from rosrm.extensions.plugin_calls import Plugin, titled
@@ -70,7 +70,7 @@ class Deadlines:
     def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
         """Return the answer of a call; raises `PluginError` or the plugin's own exception."""
         account = self._accounts.get(plugin)
-        began = time.monotonic()
+        began = clocks.awake_time()
         if account is not None and began < account.until:
             raise PluginError(account.text)
         late = partial(self._expired, plugin)
@@ -80,7 +80,7 @@ class Deadlines:
             self._accounts[plugin].text = describe_plugin_fault(fault)
             raise
         finally:
-            took = time.monotonic() - began
+            took = clocks.awake_time() - began
             self.spent += took
             if took > self._seconds * _SLOW:
                 self._charge(plugin, took)
@@ -97,7 +97,7 @@ class Deadlines:
 
     def _charge(self, plugin: Plugin, took: float) -> None:
         """Count a slow call; begin a pause if the plugin has held the loop for too long."""
-        account, now = self._accounts.setdefault(plugin, _Account()), time.monotonic()
+        account, now = self._accounts.setdefault(plugin, _Account()), clocks.awake_time()
         account.slow = max(0.0, account.slow - (now - account.at) * _GIVEN_BACK) + took
         account.at = now
         if account.slow > self._seconds * _MOST_SLOW and account.until < now:
@@ -110,5 +110,5 @@ class Deadlines:
         account = self._accounts.setdefault(plugin, _Account())
         doubled = min(account.pause * 2.0, self._pause * _LONGEST)
         account.pause = max(self._pause, doubled)
-        account.until = time.monotonic() + account.pause
+        account.until = clocks.awake_time() + account.pause
         return account.pause

@@ -19,6 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar, Final, TypeVar
 
+from rosrm import clocks
 from rosrm.errors import place_in_stack
 
 T = TypeVar("T")
@@ -56,7 +57,7 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
 
 
 def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T:
-    alarm = _Alarm(inspect.currentframe(), time.monotonic() + seconds)
+    alarm = _Alarm(inspect.currentframe(), clocks.awake_time() + seconds)
     outer, _Alarm.ringing = _Alarm.ringing, alarm
     # A process has one timer, so that of a test runner or of an outer limit is restored afterwards.
     before = signal.signal(signal.SIGALRM, _ring)
@@ -138,7 +139,7 @@ class _Alarm:
             self._log_place(frame)
             self._trace_from(frame)
             signal.setitimer(signal.ITIMER_REAL, _SOON, _SOON)
-        self._rung_at = self._rung_at or time.monotonic()
+        self._rung_at = self._rung_at or clocks.awake_time()
         raise self._next_interrupt()
 
     def force(self) -> None:
@@ -156,7 +157,7 @@ class _Alarm:
         return self.interrupt
 
     def _log_place(self, frame: FrameType | None) -> None:
-        now = time.monotonic()
+        now = clocks.awake_time()
         if now - self._logged_at < _LOG_PERIOD:
             return
         self._logged_at = now
@@ -205,7 +206,7 @@ class _Watch:
         while True:
             time.sleep(_WATCH_PERIOD)
             alarm = _Alarm.ringing
-            if alarm is None or time.monotonic() < alarm.deadline + _WATCH_PERIOD:
+            if alarm is None or clocks.awake_time() < alarm.deadline + _WATCH_PERIOD:
                 continue
             with cls.lock:
                 if alarm.is_running:

@@ -13,12 +13,12 @@ import os
 import shutil
 import sqlite3
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import JournalBlocked, JournalError
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
@@ -56,7 +56,7 @@ class _Found:
     whole: bool = True
 
 
-def recover(path: Path, wall: Callable[[], float] = time.time) -> str:
+def recover(path: Path, wall: Callable[[], float] = clocks.wall_time) -> str:
     """Write a new journal from the readable part of a damaged one.
 
     Args:

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import json
 import sqlite3
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.journal.errors import fault_of, no_journal, other_version
 from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
@@ -63,7 +63,7 @@ class SqliteJournal:
         sync: str = "normal",
         keep_events: int = 100_000,
         keep_bytes: int = 200_000_000,
-        wall: Callable[[], float] = time.time,
+        wall: Callable[[], float] = clocks.wall_time,
     ) -> None:
         self._path = path
         self._wall = wall

@@ -6,6 +6,7 @@ import os
 import time
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import NoMaster
 from rosrm.keys import key_files
 from rosrm.keys.roles import Principal, SecurityMode
@@ -49,9 +50,9 @@ def user_security(mode: SecurityMode, timeout: float = 0.0) -> Member:
         NoMaster: this user has no key after `timeout`.
         ConfigError: a key file is invalid, or others can read it.
     """
-    deadline = time.monotonic() + timeout
+    deadline = clocks.boot_time() + timeout
     me = Principal("user", key_files.user_name())
-    while (found := _member(mode, me)) is None and time.monotonic() < deadline:
+    while (found := _member(mode, me)) is None and clocks.boot_time() < deadline:
         time.sleep(_LOOK)
     if found is None:
         home = key_files.key_home()

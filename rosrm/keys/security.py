@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -12,6 +11,7 @@ from typing import Final, Protocol
 from nacl.bindings import crypto_sign, crypto_sign_open
 from nacl.exceptions import CryptoError
 
+from rosrm import clocks
 from rosrm.errors import ConfigError
 from rosrm.keys.cluster import ClusterSecret, PrincipalKey, Principals, own_grant
 from rosrm.keys.derivation import derived
@@ -181,14 +181,14 @@ class MemberSecurity:
 
     def note_beat(self, tickets_from: int) -> None:
         """Store the time of a beat of the master, and the lowest version of tickets in force."""
-        self.tickets_from, self._beat_at = tickets_from, time.monotonic_ns()
+        self.tickets_from, self._beat_at = tickets_from, clocks.boot_time_ns()
 
     def accepts(self, ticket: Ticket) -> bool:
         """Return True if the ticket of a genuine request is in force."""
         return ticket.version >= self.tickets_from and self._is_valid(ticket)
 
     def _is_valid(self, ticket: Ticket) -> bool:
-        return ticket.is_valid(time.monotonic_ns(), self._beat_at)
+        return ticket.is_valid(clocks.boot_time_ns(), self._beat_at)
 
     def bearer(self, ticket: str, key: bytes, run: bytes) -> Peer:
         """Return the slave to which this slave or client sends requests with a ticket.

@@ -8,12 +8,12 @@ import logging
 import os
 import signal
 import socket
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from rosrm import clocks
 from rosrm.artifacts.store import ArtifactStore
 from rosrm.config.placement import settings_of_chain
 from rosrm.config.settings import ClusterConfig
@@ -136,7 +136,7 @@ class MasterRuntime:
         self._checkpoint = checkpoint
         self._declared = declared
         self._plugins = list(plugins)
-        self._started = time.monotonic()
+        self._started = clocks.boot_time()
         self._stopping = ""
         self._recorder: Recorder | None = None
         self._held: JournalStall | None = None
@@ -212,7 +212,7 @@ class MasterRuntime:
         state.plugins.limit = self._deadlines
         state.chain_of = self._reload.chain_of
         state.scoring = state.scoring_in_force = settings_of_chain(self._config)
-        state.wall = time.time()
+        state.wall = clocks.wall_time()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
         return state
@@ -295,7 +295,7 @@ class MasterRuntime:
         return self._held.refusal if self._held is not None else ""
 
     def _now(self) -> float:
-        return time.monotonic()
+        return clocks.boot_time()
 
     def _used_artifacts(self) -> frozenset[str]:
         """Return the digests of the artifacts of all processes, kept versions and modes."""
@@ -399,7 +399,7 @@ class MasterRuntime:
                 self._state, self._endpoint.take_events(), self._endpoint.services.reply
             )
             return
-        self._state.wall = time.time()
+        self._state.wall = clocks.wall_time()
         core_now, spent = self._core_now(now), self._deadlines.spent
         self._endpoint.poll_first_readings()
         while self._held is None and (events := self._take_events()):
@@ -430,7 +430,7 @@ class MasterRuntime:
             self._behind += blocked
 
     def _carry_out(self, commands: Sequence[Command], now: float) -> None:
-        self._endpoint.links.decided_at = time.time_ns()
+        self._endpoint.links.decided_at = clocks.wall_time_ns()
         try:
             stored = self._write(commands)
         except JournalBlocked as fault:

@@ -17,6 +17,7 @@ from typing import Any, Final
 
 from rclpy.node import Node
 
+from rosrm import clocks
 from rosrm.component import link
 from rosrm.node.identity import made_for
 
@@ -107,8 +108,8 @@ class ComponentLinks:
         while not ended.done():
             time.sleep(_LOOK)
             if killed_at is None and _is_gone(connection):
-                killed_at = time.monotonic()
-            if killed_at is not None and time.monotonic() - killed_at > _PATIENCE:
+                killed_at = clocks.boot_time()
+            if killed_at is not None and clocks.boot_time() - killed_at > _PATIENCE:
                 os.kill(os.getpid(), signal.SIGKILL)
 
     def _destroy(self, node: Node) -> None:

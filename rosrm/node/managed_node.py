@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import itertools
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
 from typing import Any, Final
 
 from rclpy.executors import MultiThreadedExecutor
 
+from rosrm import clocks
 from rosrm.node.entities import (
     DeferredAnswer,
     GatedPublisher,
@@ -114,7 +114,7 @@ class NodeEntities:
         return self._replay.is_on
 
     def _new_buffer(self) -> InputBuffer:
-        return InputBuffer(BUFFER_LIMIT, BUFFER_BYTES, time.monotonic())
+        return InputBuffer(BUFFER_LIMIT, BUFFER_BYTES, clocks.boot_time())
 
     # --- entities of the author ------------------------------------------------------------
 
@@ -243,7 +243,7 @@ class NodeEntities:
         """Return True if the source processed this message before the message arrived here."""
         if not self._late_until:
             return False
-        if time.monotonic() >= self._late_until:
+        if clocks.boot_time() >= self._late_until:
             self._late_until = 0.0
             return False
         return self.buffer.is_marked(one.key, info["source_timestamp"])
@@ -255,13 +255,13 @@ class NodeEntities:
         sent = Sent(info["source_timestamp"], info["publication_sequence_number"] or None)
         if not one.is_ordered():
             self.buffer.mix(one.key)
-        item, now = (one, message, info), time.monotonic()
+        item, now = (one, message, info), clocks.boot_time()
         if not self.buffer.add(one.key, sent, item, now, size_of(message)):
             self.on_overflow(one.topic)
 
     def _may_catch_up(self, one: Input) -> bool:
         """Return True if no other thread holds an older message, and this node is not busy."""
-        busy = self.mode is Mode.ACTIVE and time.monotonic() >= self._late_until
+        busy = self.mode is Mode.ACTIVE and clocks.boot_time() >= self._late_until
         return not busy and (self._is_one_thread() or one.is_ordered())
 
     def _is_one_thread(self) -> bool:
@@ -304,7 +304,7 @@ class NodeEntities:
     def _serve_next(self) -> bool:
         if self.mode is not Mode.ACTIVE:
             return False
-        if time.monotonic() < self._late_until:
+        if clocks.boot_time() < self._late_until:
             self.catch_up()  # afterwards only the reader's depth bounds a busy node's backlog
         buffered = self.buffer.take()
         if buffered is not None:
@@ -372,7 +372,7 @@ class NodeEntities:
         for one in inputs:
             self.buffer.cover(
                 one.topic, one.covered, processed=one.processed, single=one.publishers <= 1,
-                now=time.monotonic(),
+                now=clocks.boot_time(),
             )  # fmt: skip
 
     def inherit(self, inputs: Iterable[CoveredInput]) -> None:
@@ -406,7 +406,7 @@ class NodeEntities:
         """
         self.mode = Mode.ACTIVE
         self._gate.is_open = True
-        self._late_until = time.monotonic() + _LATE
+        self._late_until = clocks.boot_time() + _LATE
         self._due_at_start = timers_due
         announce()
         self._replay.begin(self._start(timers_due, since, settle))
@@ -417,7 +417,7 @@ class NodeEntities:
         """Start timers and services in steps of some ms; new messages are served between steps."""
         if not self._is_active():
             return
-        self._start_timers(timers_due, time.monotonic() - since)
+        self._start_timers(timers_due, clocks.boot_time() - since)
         self._due_at_start = None
         for opening in list(self._openings):
             yield

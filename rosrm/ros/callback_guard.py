@@ -7,10 +7,10 @@ segmentation fault that names no cause. So rosrm catches all of them.
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import Refused, describe_fault, place_in_rosrm
 
 _log = logging.getLogger("rosrm.callbacks")
@@ -28,7 +28,7 @@ class CallbackGuard:
         dropped: number of callbacks that failed, each with its message.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = clocks.boot_time) -> None:
         self.interrupted: BaseException | None = None
         self.dropped = 0
         self._clock = clock

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 import os
-import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Final
 
+from rosrm import clocks
 from rosrm.errors import Refused
 from rosrm.keys.links import Link
 from rosrm.keys.roles import Role
@@ -228,7 +228,7 @@ class ControlServer:
         if gate is None:
             is_operator = sender.grant.role is not Role.SUBMITTER
             bound = bound_of(Store.ANSWERS, is_operator=is_operator)
-            gate = RequestGate(time.monotonic_ns, self._max_age, remembered, bound)
+            gate = RequestGate(clocks.boot_time_ns, self._max_age, remembered, bound)
             self._gates[sender.link, remembered] = gate
         return gate
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from rosrm import clocks
 from rosrm.errors import NoMaster, Refused
 from rosrm.keys.finding import user_security
 from rosrm.keys.roles import SecurityMode
@@ -79,7 +80,7 @@ def wait_for_service(
 ) -> bool:  # fmt: skip
     """Return True if a service is discovered before `deadline` (monotonic seconds)."""
     while not client.service_is_ready():
-        if time.monotonic() >= deadline:
+        if clocks.boot_time() >= deadline:
             return False
         on_look()
         _spin(participant, _LOOK)
@@ -94,7 +95,7 @@ def wait_until(
     `look`: most seconds between two calls of `done`, which each message calls as well.
     """
     while not done():
-        left = deadline - time.monotonic()
+        left = deadline - clocks.boot_time()
         if left <= 0.0:
             return False
         _spin(participant, min(left, look))
@@ -108,7 +109,7 @@ class _Answers:
     on_wait: OnWait | None = None
     first: tuple[Any, ...] = ()
     sent: int = 0
-    began: float = field(default_factory=time.monotonic)
+    began: float = field(default_factory=clocks.boot_time)
     reported: float = -math.inf
 
     def take(self, future: Any) -> None:
@@ -116,7 +117,7 @@ class _Answers:
 
     def wait(self) -> None:
         """Call `on_wait` with the seconds since the request, at most every 0.1 s."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         if self.on_wait is not None and now - self.reported >= _REPORT_EVERY:
             self.reported = now
             self.on_wait(now - self.began)
@@ -167,7 +168,7 @@ def _ask_until_answered(
         return bool(answers.first) or servers() != known
 
     while not answers.first:
-        now = time.monotonic()
+        now = clocks.boot_time()
         if now >= deadline:
             return answers
         known = servers()
@@ -244,7 +245,7 @@ class MasterClient:
             NoMaster: none answered, or this user has no key.
             Refused: the master has another version.
         """
-        begun = time.monotonic() if begun is None else begun
+        begun = clocks.boot_time() if begun is None else begun
         settings.check()
         try:
             member = user_security(security, timeout)
@@ -262,12 +263,12 @@ class MasterClient:
 
     def _greet(self, timeout: float, begun: float) -> None:
         """Find the master; raise `NoMaster` or `Refused`."""
-        hello = self._shake_hands(time.monotonic() + timeout)
+        hello = self._shake_hands(clocks.boot_time() + timeout)
         settings = self._settings
         if hello is None:
             security, advice = _about_security(self._security.described)
             raise NoMaster(
-                f"no master answered within {time.monotonic() - begun:.1f} s "
+                f"no master answered within {clocks.boot_time() - begun:.1f} s "
                 f"({settings.describe()}, namespace {settings.namespace}, {security}). "
                 f"{_to_check(settings)} {advice}"
             )
@@ -284,7 +285,7 @@ class MasterClient:
             srv.Handshake, names.HANDSHAKE, request, deadline, _GREET_AGAIN
         ).answer
         if hello is not None:
-            self._master, self._last_contact = hello, time.monotonic()
+            self._master, self._last_contact = hello, clocks.boot_time()
         return hello
 
     @property
@@ -484,7 +485,7 @@ class MasterClient:
 
     def _envelope(self) -> Any:
         """Return a request's envelope; renew the beat before the master would reject it as old."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         if now - self._last_contact > 1.0 and self._shake_hands(now + self._timeout) is None:
             raise self._silent(_MASTER)
         return new_envelope(self._sender, self._master.beat, self._master.epoch)
@@ -562,7 +563,7 @@ class MasterClient:
         response = calls.open(master, sent, answer)
         if response is not None:
             answers.first = (response,)
-        elif time.monotonic() >= until:
+        elif clocks.boot_time() >= until:
             self._socket = ""  # DDS from now on, so that no later request waits for this socket
         if self._load is not None:
             _spin(self._participant, 0.0)  # takes the load that has arrived
@@ -581,7 +582,7 @@ class MasterClient:
         who = f"the slave of {host}"
         for is_repeated in (False, True):
             client = self._introduced(host, process)
-            if not wait_for_service(self._participant, client, time.monotonic() + self._timeout):
+            if not wait_for_service(self._participant, client, clocks.boot_time() + self._timeout):
                 raise self._silent(who)
             ask = partial(_ask_until_answered, self._participant, client, request, again=_AGAIN)
             try:
@@ -595,7 +596,7 @@ class MasterClient:
     def _introduced(self, host: str, process: str) -> SealedClient:
         """Return the client of a slave, with a valid ticket for the logs of a process."""
         known = self._introductions.get((host, process))
-        if known is None or time.monotonic() >= known.until:
+        if known is None or clocks.boot_time() >= known.until:
             known = self._introductions[host, process] = self._introduce(host, process)
         client = self._log_clients.get(host)
         if client is None:
@@ -607,7 +608,7 @@ class MasterClient:
         return client
 
     def _introduce(self, host: str, process: str) -> Introduction:
-        now = time.monotonic()
+        now = clocks.boot_time()
         if len(self._introductions) >= _MOST_INTRODUCTIONS:
             known = self._introductions.items()
             self._introductions = {at: one for at, one in known if now < one.until}
@@ -647,7 +648,7 @@ class MasterClient:
         One that exceeds its bounds is not sent: `Refused` names the field.
         """
         check_bounds(request)
-        deadline = time.monotonic() + max(self._timeout, patience)
+        deadline = clocks.boot_time() + max(self._timeout, patience)
         answers = ask(deadline=deadline)
         response = answers.answer
         acts = hasattr(request, "envelope")  # read-only requests have none
@@ -670,7 +671,7 @@ class MasterClient:
         if kind is srv.List:
             return ""
         request = srv.List.Request(protocol_version=PROTOCOL_VERSION)
-        deadline = time.monotonic() + _AGAIN
+        deadline = clocks.boot_time() + _AGAIN
         answer = self._ask_master(srv.List, names.LIST, request, deadline, _GREET_AGAIN).answer
         trouble = answer.trouble if answer is not None else ""
         return f": {trouble}. The request may still be executed then" if trouble else ""

@@ -13,10 +13,10 @@ from __future__ import annotations
 import select
 import socket
 import struct
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.keys.hashing import digest_of
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros.sealed_codec import Envelope, decode, encode
@@ -80,15 +80,15 @@ def ask(
     `on_wait` is called about every 0.1 s with the seconds since the request; an exception that it
     raises ends the wait.
     """
-    began, answering = time.monotonic(), select.poll()
+    began, answering = clocks.boot_time(), select.poll()
     answering.register(connection, select.POLLIN)
     try:
         send(connection, request, until)
         while not answering.poll(_REPORT_EVERY * 1e3):
-            if time.monotonic() >= until:
+            if clocks.boot_time() >= until:
                 return None
             if on_wait is not None:
-                on_wait(time.monotonic() - began)
+                on_wait(clocks.boot_time() - began)
         return decode(receive(connection, _MOST_ANSWER, until))
     except OSError:
         return None
@@ -96,7 +96,7 @@ def ask(
 
 def send(connection: socket.socket, content: bytes, until: float) -> None:
     """Send a frame; raise `OSError` if that has not ended at `until` (monotonic seconds)."""
-    connection.settimeout(max(_SHORTEST, until - time.monotonic()))
+    connection.settimeout(max(_SHORTEST, until - clocks.boot_time()))
     connection.sendall(_LENGTH.pack(len(content)) + content)
 
 
@@ -108,7 +108,7 @@ def receive(connection: socket.socket, most: int, until: float) -> bytes:
     """
     data, size = bytearray(), _LENGTH.size
     while len(data) < size:
-        connection.settimeout(max(_SHORTEST, until - time.monotonic()))
+        connection.settimeout(max(_SHORTEST, until - clocks.boot_time()))
         part = connection.recv(_PIECE)
         if not part:
             raise ConnectionError("the other side has closed the connection")

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -19,6 +18,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from rosrm import clocks
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
 from rosrm.ros.callback_guard import CallbackGuard
@@ -78,7 +78,7 @@ class Participant:
             # `rclpy.init`, this installs no signal handlers.
             self.context.init(domain_id=settings.domain, initialize_logging=False)
             self.node = self._lean_node(name)
-        self.created_at = time.monotonic()
+        self.created_at = clocks.boot_time()
         use_exact_timers()
         self.executor = EventsExecutor(context=self.context)
         self.executor.add_node(self.node)
@@ -128,8 +128,8 @@ class Participant:
         """
         first = before = self._executed
         self.executor.spin_once(timeout_sec=timeout)
-        flooded = time.monotonic() + _FLOOD
-        while self._executed != before and time.monotonic() < flooded:
+        flooded = clocks.boot_time() + _FLOOD
+        while self._executed != before and clocks.boot_time() < flooded:
             before = self._executed
             self.executor.spin_once(timeout_sec=0.0)
         self.guard.raise_interrupt()

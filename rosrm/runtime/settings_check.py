@@ -9,11 +9,11 @@ import os
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import IO, Any, Final, Generic, TypeVar
 
+from rosrm import clocks
 from rosrm.model.orders import CHECK_TIMEOUT
 
 Config = TypeVar("Config")
@@ -87,7 +87,7 @@ class SettingsCheck(Generic[Config]):
             stdin=subprocess.DEVNULL, stdout=self._output, stderr=self._errors,
             env={**os.environ, "PYTHONWARNINGS": "ignore"},
         )  # fmt: skip
-        self._deadline = time.monotonic() + CHECK_TIMEOUT - 1.0
+        self._deadline = clocks.boot_time() + CHECK_TIMEOUT - 1.0
 
     def poll(self) -> None:
         """Report the outcome of a check that has ended, or took too long."""
@@ -98,7 +98,7 @@ class SettingsCheck(Generic[Config]):
         if process is None:
             return
         code = process.poll()
-        if code is None and time.monotonic() < self._deadline:
+        if code is None and clocks.boot_time() < self._deadline:
             return
         if code is None:
             process.kill()

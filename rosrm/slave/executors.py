@@ -6,11 +6,11 @@ import json
 import logging
 import math
 import threading
-import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import PluginError, Refused, RosrmError
 from rosrm.extensions.contracts import Executor
 from rosrm.extensions.discovery import definition
@@ -47,7 +47,7 @@ class Executors:
     def __init__(
         self, offered: Mapping[str, OfferedExecutor], broken: Mapping[str, str], *,
         post: Callable[[Callable[[], None]], None], changed: Callable[[str], None],
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clocks.boot_time,
     ) -> None:  # fmt: skip
         self._offered = offered
         self._post = post

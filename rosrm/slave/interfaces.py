@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 import socket
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.model.links import INTERFACES, Interface
 from rosrm.model.ros_settings import RosSettings
 from rosrm.runtime.addresses import addresses
@@ -51,7 +51,7 @@ class Traffic:
 
     def __init__(
         self, rate: float | None, rates: Mapping[str, float],
-        clock: Callable[[], float] = time.monotonic, classes: Path = _CLASSES,
+        clock: Callable[[], float] = clocks.boot_time, classes: Path = _CLASSES,
     ) -> None:  # fmt: skip
         self._rate, self._rates = rate, rates
         self._clock = clock

@@ -14,11 +14,11 @@ import math
 import os
 import socket
 import struct
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
+from rosrm import clocks
 from rosrm.config.settings import LinkSettings
 from rosrm.keys import link_packets
 from rosrm.keys.link_packets import NONCE_BYTES, PACKET_BYTES, Packet
@@ -120,7 +120,7 @@ class LinkProber:
         """Measure links; `done` gets the report within `MEASURE_SECONDS`."""
         if self._open is not None:
             self._finish(self._open)
-        now = time.monotonic()
+        now = clocks.boot_time()
         rounds = 0 if order.peers else _PROBES
         self._open = _Measurement(order, done, now + MEASURE_SECONDS - _MARGIN, now, rounds)
         self.turn(now)
@@ -166,7 +166,7 @@ class LinkProber:
 
     def _answer(self, packet: Packet, arrived: int, sender: tuple[str, int]) -> None:
         key = self._key_of(packet.host_id)
-        self._send(link_packets.echo(key, packet, time.time_ns() - arrived), sender)
+        self._send(link_packets.echo(key, packet, clocks.wall_time_ns() - arrived), sender)
 
     def _take_echo(self, packet: Packet, arrived: int) -> None:
         sent = self._sent.pop(packet.nonce)
@@ -184,7 +184,7 @@ class LinkProber:
             for address in (known,) if known in peer.addresses else peer.addresses:
                 nonce = os.urandom(NONCE_BYTES)
                 content = link_packets.probe(peer.key, self._own_id(), nonce)
-                self._sent[nonce] = _Sent(peer, address, time.time_ns())
+                self._sent[nonce] = _Sent(peer, address, clocks.wall_time_ns())
                 self._send(content, (address, peer.port))
 
     def _send(self, content: bytes, receiver: tuple[str, int]) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from rosrm import clocks
 from rosrm.errors import Refused
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
@@ -194,5 +194,5 @@ def _marks(
     if len(found) == _MOST_MARKS:
         return list(found), min(end, found[-1].offset)
     if now and (not found or found[-1].offset < end):
-        found.append(log_index.Mark(time.time(), end, 0))
+        found.append(log_index.Mark(clocks.wall_time(), end, 0))
     return list(found), end

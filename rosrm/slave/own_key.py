@@ -7,6 +7,7 @@ import os
 import time
 from typing import Final
 
+from rosrm import clocks
 from rosrm.config.settings import HostConfig
 from rosrm.keys import key_files
 from rosrm.keys.cluster import PrincipalKey, own_grant
@@ -30,7 +31,7 @@ def wait_for_security(config: HostConfig) -> Member:
     """
     logged_at = -_LOG_PERIOD
     while (found := host_security(config.security, config.host)) is None:
-        now = time.monotonic()
+        now = clocks.boot_time()
         if now - logged_at >= _LOG_PERIOD:
             logged_at = now
             _log.info("%s", _how_to_get_a_key(config.host))

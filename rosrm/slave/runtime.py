@@ -8,7 +8,6 @@ import os
 import signal
 import socket
 import sys
-import time
 from array import array
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -17,6 +16,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
@@ -296,7 +296,7 @@ class SlaveRuntime:
     def _adopt(self) -> None:
         """Re-adopt the instances that a former run of this slave left with the supervisor."""
         held = self._supervisor.take_over()
-        self._work(time.monotonic())
+        self._work(clocks.boot_time())
         if held:
             _log.info("%s", self._found(held))
 
@@ -329,12 +329,12 @@ class SlaveRuntime:
         self._stopping = STOP_ALL
         self._supervisor.listen()
         with self._closing:
-            deadline = time.monotonic() + _MASTER_PATIENCE
+            deadline = clocks.boot_time() + _MASTER_PATIENCE
             self._serve(
                 lambda: (
                     not (self._is_registered or self._endpoint.failure)
                     and not self._ending.supervisor_left
-                    and time.monotonic() < deadline
+                    and clocks.boot_time() < deadline
                 )
             )
             reached = self._is_registered
@@ -354,7 +354,7 @@ class SlaveRuntime:
 
     def _serve(self, condition: Callable[[], bool]) -> None:
         end_start()
-        now = time.monotonic()
+        now = clocks.boot_time()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
         next_sample = next_usage = next_graph = next_health = next_devices = now
         logged_at = now - _LOG_PERIOD
@@ -387,8 +387,8 @@ class SlaveRuntime:
             wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
             wake = min(wake, next_health) if self._health.watches else wake
             was_registered = self._is_registered
-            self._participant.spin(max(0.0, wake - time.monotonic()))
-            now = time.monotonic()
+            self._participant.spin(max(0.0, wake - clocks.boot_time()))
+            now = clocks.boot_time()
             self._work(now)
             if self._is_registered and not was_registered:
                 self._cycle(now)  # the master gives no work before the first reading
@@ -573,9 +573,9 @@ class SlaveRuntime:
             for settled in self._unreached.pop((command.instance, command.goal), []):
                 settled(command.refusal, command.code)
         elif isinstance(command, commands.ReadLifecycleState | commands.ChangeLifecycleState):
-            self._participant.guard.call(self._lifecycle_clients.send, command, time.monotonic())
+            self._participant.guard.call(self._lifecycle_clients.send, command, clocks.boot_time())
         elif isinstance(command, commands.ListComponents | commands.LoadComponent):
-            self._participant.guard.call(self._component_loads.send, command, time.monotonic())
+            self._participant.guard.call(self._component_loads.send, command, clocks.boot_time())
         else:
             self._have_supervisor(command)
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -33,6 +32,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
+from rosrm import clocks
 from rosrm.errors import PluginError
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import titled
@@ -128,7 +128,7 @@ class Sampler:
     """
 
     def __init__(
-        self, probes: Sequence[MadeProbe], *, clock: Callable[[], float] = time.monotonic
+        self, probes: Sequence[MadeProbe], *, clock: Callable[[], float] = clocks.boot_time
     ) -> None:
         self.resources: Final = tuple(resource for made in probes for resource in made.resources)
         self._clock = clock
@@ -179,9 +179,9 @@ class Sampler:
 
     def settle(self, timeout: float) -> bool:
         """Wait until no read is running; return False if one still runs after `timeout` seconds."""
-        end = time.monotonic() + timeout
+        end = clocks.boot_time() + timeout
         while any(watched.busy for watched in self._watched):
-            if not self._progress.wait(max(0.0, end - time.monotonic())):
+            if not self._progress.wait(max(0.0, end - clocks.boot_time())):
                 return False
             self._progress.clear()
         return True
@@ -206,11 +206,11 @@ class Sampler:
             if watched.lane.alive() or not watched.busy:
                 watched.lane.put(watched.close)
         lanes = {id(lane): lane for lane in [*(w.lane for w in self._watched), self._shared]}
-        end = time.monotonic() + timeout
+        end = clocks.boot_time() + timeout
         for lane in lanes.values():
             lane.end()
         for lane in [*lanes.values(), *self._left]:
-            lane.join(max(0.0, end - time.monotonic()))
+            lane.join(max(0.0, end - clocks.boot_time()))
         return tuple(watched.name for watched in self._watched if not watched.closed)
 
     def _check_running_read(self, watched: _Watched, now: float) -> None:

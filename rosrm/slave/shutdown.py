@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from rosrm import clocks
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands
 from rosrm.core.slave.state import SlaveState
@@ -136,8 +136,8 @@ class Shutdown:
         return code
 
     def _serve_for(self, seconds: float) -> None:
-        deadline = time.monotonic() + seconds
-        self.serve(lambda: not self.supervisor_left and time.monotonic() < deadline)
+        deadline = clocks.boot_time() + seconds
+        self.serve(lambda: not self.supervisor_left and clocks.boot_time() < deadline)
 
     def _kill(self, longest: float) -> None:
         """Kill what has not ended, whatever its `stop` was in the release that started it."""
@@ -156,8 +156,8 @@ class Shutdown:
             self._is_informed = True
 
         self.endpoint.leave(informed, running)
-        deadline = time.monotonic() + _LEAVE_PATIENCE
-        self.serve(lambda: not self._is_informed and time.monotonic() < deadline)
+        deadline = clocks.boot_time() + _LEAVE_PATIENCE
+        self.serve(lambda: not self._is_informed and clocks.boot_time() < deadline)
 
     def _begun(self) -> list[InstanceStatus]:
         """Return the statuses of all instances except those that still wait for their start."""
@@ -174,7 +174,7 @@ class Shutdown:
             math.inf if stop is None else stop.interrupt_grace + stop.terminate_grace
             for stop in self._stops()
         ]
-        return time.monotonic() + max(graces, default=0.0)
+        return clocks.boot_time() + max(graces, default=0.0)
 
     def _stops(self) -> list[StopPolicy | None]:
         alive = self.state.alive.values()
@@ -182,7 +182,7 @@ class Shutdown:
 
     def _kill_after(self) -> str:
         """Return the end of a sentence with the time until SIGKILL; "": unknown, or it was sent."""
-        left = self._kill_at - time.monotonic()
+        left = self._kill_at - clocks.boot_time()
         if not 0.0 < left < math.inf:
             return ""
         return f"; processes that run after {math.ceil(left)} s are killed (SIGKILL)"

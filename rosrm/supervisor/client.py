@@ -6,11 +6,11 @@ import contextlib
 import os
 import socket
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from rosrm import clocks
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.errors import SupervisorError
 from rosrm.model.start_trace import stamped_in
@@ -120,7 +120,7 @@ class SupervisorClient:
             SupervisorError: there is none and none can be started in time, or it refused.
         """
         state = Path(os.path.abspath(state_directory))
-        deadline = time.monotonic() + timeout
+        deadline = clocks.boot_time() + timeout
         while True:
             try:
                 return cls._connect_once(state, start, log, deadline)
@@ -129,7 +129,7 @@ class SupervisorClient:
                 raise SupervisorSilent(silent) from None
             except SupervisorGone:
                 # A dying supervisor still accepts connections for an instant.
-                if time.monotonic() > deadline:
+                if clocks.boot_time() > deadline:
                     raise
 
     @classmethod
@@ -178,11 +178,11 @@ class SupervisorClient:
             SupervisorGone: the supervisor was killed; its processes keep running.
             SupervisorError: the supervisor refused, or sent an unreadable message.
         """
-        deadline = None if timeout is None else time.monotonic() + timeout
+        deadline = None if timeout is None else clocks.boot_time() + timeout
         while not self._received:
             if self._failure is not None:
                 raise self._failure
-            wait = None if deadline is None else max(0.0, deadline - time.monotonic())
+            wait = None if deadline is None else max(0.0, deadline - clocks.boot_time())
             if not readable(self._peer, wait):
                 return []
             self._read()
@@ -205,7 +205,7 @@ class SupervisorClient:
 
     def _launch(self, order: LaunchOrder) -> messages.Launch:
         base = self._base or {}
-        environment = stamped_in(order.environment, launch_sent=time.time_ns())
+        environment = stamped_in(order.environment, launch_sent=clocks.wall_time_ns())
         changes: dict[str, str | None] = {
             name: value for name, value in environment.items() if base.get(name) != value
         }
@@ -243,7 +243,7 @@ class SupervisorClient:
         while not self.pid:
             if self._failure is not None:
                 raise self._failure
-            if not readable(self._peer, max(0.0, deadline - time.monotonic())):
+            if not readable(self._peer, max(0.0, deadline - clocks.boot_time())):
                 raise TimeoutError
             self._read()
 

@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import SupervisorError
 from rosrm.runtime import oom_score, private_files
 from rosrm.supervisor import endpoint
@@ -28,7 +29,7 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
     """
     while True:
         try:
-            return endpoint.connect(str(state), deadline - time.monotonic())
+            return endpoint.connect(str(state), deadline - clocks.boot_time())
         except TimeoutError:
             raise
         except (FileNotFoundError, ConnectionRefusedError):
@@ -39,7 +40,7 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
         problem = _start(state, log, deadline)
         if not problem:
             continue
-        if time.monotonic() > deadline or endpoint.ANOTHER not in problem:
+        if clocks.boot_time() > deadline or endpoint.ANOTHER not in problem:
             raise SupervisorError(f"the supervisor of {state} did not start: {problem}")
         # Another supervisor is about to listen or to end: neither can be awaited from here.
         time.sleep(0.02)
@@ -66,7 +67,7 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
     with process.stdout as output:
         answer = b""
         while not answer.startswith(b"ready\n"):
-            if not readable(output, max(0.0, deadline - time.monotonic())):
+            if not readable(output, max(0.0, deadline - clocks.boot_time())):
                 answer += b"it was not ready in time"
                 process.kill()  # the first stage; it may hang, e.g. on a disk that does not answer
                 break

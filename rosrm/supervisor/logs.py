@@ -11,10 +11,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from collections.abc import Collection, Container, Iterable
 from typing import Final, NamedTuple
 
+from rosrm import clocks
 from rosrm.core.supervisor.rules import Key
 from rosrm.model.start_trace import LINE
 from rosrm.runtime.private_files import open_private
@@ -198,7 +198,7 @@ class _Log:
         if size or self._has_index:
             self.note(size, pid)
         else:
-            self._start = Mark(time.time(), self.base, pid)
+            self._start = Mark(clocks.wall_time(), self.base, pid)
 
     def look(self, limits: LogLimits) -> int:
         """Record growth in the index, and rotate a log over its limits; return the new bytes."""
@@ -220,7 +220,7 @@ class _Log:
 
     def note(self, size: int, pid: int) -> None:
         """Record in the index that the log file now has `size` bytes."""
-        now = time.time()
+        now = clocks.wall_time()
         if size < self.size:
             # The log was truncated by hand, or by a supervisor killed before a new index.
             self.base += self.size
@@ -351,7 +351,7 @@ def rotate(path: str, size: int, limits: LogLimits) -> None:
             _unlink(f"{path}.new")
             written = os.fstat(log.fileno()).st_size
             log.truncate(0)  # also when the copy failed, above all because the disk is full
-            log_index.begin(path, Mark(time.time(), base + written, 0))
+            log_index.begin(path, Mark(clocks.wall_time(), base + written, 0))
 
 
 def _copy(log: int, target: str, offset: int, end: int) -> None:

@@ -14,6 +14,8 @@ import time
 from collections.abc import Iterator
 from typing import Final, NamedTuple
 
+from rosrm import clocks
+
 _TICKS_PER_SECOND: Final = os.sysconf("SC_CLK_TCK")
 
 #: Marks in a process's environment: its instance, and the state directory of its supervisor.
@@ -99,7 +101,7 @@ def inner_pid(pid: int, thread: int = 0) -> int:
 
 def ticks_now() -> int:
     """Return the start time that /proc would show for a process started now, in clock ticks."""
-    return int(time.clock_gettime(time.CLOCK_BOOTTIME) * _TICKS_PER_SECOND)
+    return int(clocks.boot_time() * _TICKS_PER_SECOND)
 
 
 def was_born(stat: Stat, birth: int) -> bool:
@@ -119,13 +121,13 @@ def read_environment(pid: int) -> list[bytes]:
     Raises:
         OSError: the process has ended, may not be read by us, or its execve did not end.
     """
-    deadline = time.monotonic() + _EXECVE
+    deadline = clocks.boot_time() + _EXECVE
     while True:
         with open(f"/proc/{pid}/environ", "rb") as file:
             variables = file.read()
         if variables or _has_no_environment(pid):
             return variables.split(b"\0")
-        if time.monotonic() > deadline:
+        if clocks.boot_time() > deadline:
             raise TimeoutError(errno.ETIMEDOUT, f"its execve did not end within {_EXECVE:g} s")
         time.sleep(_LOOK)
 

@@ -7,9 +7,9 @@ import errno
 import os
 import socket
 import threading
-import time
 from typing import Final
 
+from rosrm import clocks
 from rosrm.supervisor.discovery import writable
 
 #: Most bytes that may wait for the peer, beside those in its socket.
@@ -42,7 +42,7 @@ class Outgoing:
     def waits(self) -> float:
         """Seconds since the peer last took any of the waiting bytes; 0.0: nothing waits."""
         with self._lock:
-            return time.monotonic() - self._took_at if self._unsent else 0.0
+            return clocks.awake_time() - self._took_at if self._unsent else 0.0
 
     @property
     def is_free(self) -> bool:
@@ -73,7 +73,7 @@ class Outgoing:
                 view = view[self._peer.send(view, _FLAGS) :]
         except BlockingIOError:
             self._unsent += view
-            self._took_at = time.monotonic()
+            self._took_at = clocks.awake_time()
             self._thread = threading.Thread(target=self._send_rest, name="orders", daemon=True)
             self._thread.start()
 
@@ -94,7 +94,7 @@ class Outgoing:
             self._gone = True
         else:
             del self._unsent[:sent]
-            self._took_at = time.monotonic()
+            self._took_at = clocks.awake_time()
         if self._gone:
             self._unsent.clear()
         return bool(self._unsent)

@@ -12,11 +12,11 @@ import os
 import selectors
 import signal
 import socket
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final
 
+from rosrm import clocks
 from rosrm.core.supervisor import commands, events
 from rosrm.core.supervisor.events import Event, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import BACKOFF, STARTING, STOPPING
@@ -70,7 +70,7 @@ class _Start:
 
     def __init__(self, key: Key, program: spawn.Program, log: int, steps: Steps[Confined]) -> None:
         self.key, self.program, self.log, self.steps = key, program, log, steps
-        self.late = time.monotonic() + LATE_START
+        self.late = clocks.boot_time() + LATE_START
         self.due = self.late - LATE_START + spawn.PATIENCE
         self.birth = 0
         self.attempt: spawn.Attempt
@@ -145,7 +145,7 @@ class Server:
             self._take_in(0.0)
         if self._is_due():
             self._happened(events.TimePassed())
-        now = time.monotonic()
+        now = clocks.boot_time()
         self._logs.look(now)
         self._trees.look(now)
         self._groups.look(now)
@@ -162,7 +162,7 @@ class Server:
 
     def _is_due(self) -> bool:
         deadline = self._core.deadline()
-        return deadline is not None and deadline <= time.monotonic()
+        return deadline is not None and deadline <= clocks.boot_time()
 
     def _timeout(self) -> float | None:
         if self._spawns and self._room_for_starts():
@@ -170,11 +170,11 @@ class Server:
         parts = (self._core, self._logs, self._trees, self._groups)
         deadlines = [part.deadline() for part in parts]
         if self._record.trouble:
-            deadlines.append(time.monotonic() + RECORD_AGAIN)
+            deadlines.append(clocks.boot_time() + RECORD_AGAIN)
         starts = self._starts.values()
         deadlines += [start.due if self._is_late(start) else start.late for start in starts]
         due = [deadline for deadline in deadlines if deadline is not None]
-        return min(max(0.0, min(due) - time.monotonic()), LONGEST_WAIT) if due else None
+        return min(max(0.0, min(due) - clocks.boot_time()), LONGEST_WAIT) if due else None
 
     def _leave(self) -> None:
         self._groups.close()
@@ -186,7 +186,7 @@ class Server:
     # --- the core's commands ------------------------------------------------------------------
 
     def _happened(self, event: Event) -> None:
-        for command in self._core.handle(event, time.monotonic()):
+        for command in self._core.handle(event, clocks.boot_time()):
             self._execute(command)
 
     def _execute(self, command: commands.Command) -> None:
@@ -213,7 +213,7 @@ class Server:
             if instance.ended:
                 self._ended.append(key)
             elif instance.started or instance.phase == BACKOFF:  # else they may be made ahead
-                self._groups.remove(key, time.monotonic())
+                self._groups.remove(key, clocks.boot_time())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
         status = messages.Status.of(instance)
         # The slave has ordered the start, and most spawns take a moment. So `starting` is sent only
@@ -263,7 +263,7 @@ class Server:
         The removal takes time by which a held instance would otherwise start later.
         """
         for key in self._ended:
-            self._groups.remove(key, time.monotonic())
+            self._groups.remove(key, clocks.boot_time())
         self._ended.clear()
 
     def _spawn_some(self) -> None:
@@ -310,7 +310,7 @@ class Server:
 
     @staticmethod
     def _is_late(start: _Start) -> bool:
-        return time.monotonic() >= start.late
+        return clocks.boot_time() >= start.late
 
     def _check_former_start(self, key: Key) -> None:
         for process, step in self._stuck.values():
@@ -379,10 +379,10 @@ class Server:
         key, (pid, enforced, note) = start.key, confined
         environment = start.program.environment
         if start_trace.VARIABLE in environment and not self._core.instances[key].started:
-            traced = start_trace.stamped_in(environment, spawned=time.time_ns())
+            traced = start_trace.stamped_in(environment, spawned=clocks.wall_time_ns())
             logs.note_trace(start.log, traced[start_trace.VARIABLE])
         self._trees.add_child(key, pid, start.birth)
-        self._logs.watch(key, time.monotonic(), pid)
+        self._logs.watch(key, clocks.boot_time(), pid)
         self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
 
     def _adopt(self, key: Key, launch: messages.Launch, rule: AdoptionRule) -> None:
@@ -396,7 +396,7 @@ class Server:
             self._spawn_failed(key, adoption.ended(rule), transient=False)
             return
         self._logs.note_adoption(key, self._core.instances, rule.pid)
-        self._logs.watch(key, time.monotonic(), rule.pid)
+        self._logs.watch(key, clocks.boot_time(), rule.pid)
         wanted = launch.limits.wanted
         note = f"adopted, so only its first restart applies {listed(wanted)}" if wanted else ""
         self._happened(Spawned(key, rule.pid, (), note, adopted=True))
@@ -415,7 +415,8 @@ class Server:
     def _program(self, launch: messages.Launch | None) -> spawn.Program:
         if launch is None:
             raise spawn.SpawnError("its order was lost with a part of the record")
-        environment = start_trace.stamped_in(self._environment(launch), recorded=time.time_ns())
+        recorded = clocks.wall_time_ns()
+        environment = start_trace.stamped_in(self._environment(launch), recorded=recorded)
         directory = launch.directory or paths.work_directory(self._state)
         return spawn.Program(
             launch.argv, environment, directory, launch.secrets, launch.limits.nice
@@ -461,7 +462,7 @@ class Server:
         self._rewrite_record()
         for instance in self._core.instances.values():
             if instance.pid:
-                self._logs.watch(instance.key, time.monotonic())
+                self._logs.watch(instance.key, clocks.boot_time())
 
     def _rewrite_record(self) -> None:
         used = {launch.environment for launch in self._launches.values()}
@@ -575,7 +576,7 @@ class Server:
     def _start(self, launch: messages.Launch) -> None:
         if launch.environment not in self._environments:
             raise ProtocolError(f"unknown environment {launch.environment!r}")
-        received = start_trace.stamped_in(launch.changes, supervisor_received=time.time_ns())
+        received = start_trace.stamped_in(launch.changes, supervisor_received=clocks.wall_time_ns())
         if received is not launch.changes:
             launch = launch._replace(changes=received)
         if launch.instance not in self._core.instances:
@@ -589,7 +590,7 @@ class Server:
         )  # fmt: skip
 
     def _renew(self, order: events.ContactReported) -> None:
-        now = time.monotonic()
+        now = clocks.boot_time()
         newest = events.ContactReported(min(order.at, now), min(order.alive, now))
         self._last_contact.keep(newest)
         self._happened(newest)

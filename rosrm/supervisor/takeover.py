@@ -11,9 +11,9 @@ and its restart policy decides.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 
+from rosrm import clocks
 from rosrm.core.supervisor.events import Event, Exited, Resumed, SessionEnded, Spawned, SpawnFailed
 from rosrm.core.supervisor.instance import (
     HELD,
@@ -37,7 +37,7 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
     newest = lease_file.read(state)
     for instance in recorded.instances.values():
         if not recorded.same_boot:
-            _restart_clock(instance, time.monotonic())
+            _restart_clock(instance, clocks.boot_time())
         alive = instance.fence is not None and instance.fence.alive
         instance.heard = max(instance.heard, newest.at, newest.alive if alive else 0.0)
         core.restore(instance)

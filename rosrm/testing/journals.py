@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 from unittest import SkipTest
 
+from rosrm import clocks
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Journal, Record, StoredRecord
 
@@ -33,7 +33,7 @@ class MemoryJournal:
     ) -> Sequence[StoredRecord]:
         """Append records and replace intents."""
         first = len(self.stored) + 1
-        wall = time.time()
+        wall = clocks.wall_time()
         stored = [StoredRecord(first + at, wall, now, record) for at, record in enumerate(records)]
         self.stored += stored
         for intent in intents:

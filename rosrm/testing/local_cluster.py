@@ -13,7 +13,6 @@ import re
 import signal
 import socket
 import subprocess
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from typing import TYPE_CHECKING, Final
 
 import psutil
 
+from rosrm import clocks
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.ros_settings import RosSettings
@@ -162,7 +162,7 @@ class LocalCluster:
         running = [item for item in self.slaves.items() if item[1].process.poll() is None]
         pids = {host: part.process.pid for host, part in running}
         slave = self.slaves.pop(name).process
-        at = time.time()
+        at = clocks.wall_time()
         stopped: set[int] = set()
         # A process that is stopped by a signal starts no other, so the loop ends.
         while found := _processes_of(self.directory / "hosts", name, pids) - stopped:
@@ -177,7 +177,7 @@ class LocalCluster:
     @property
     def client(self) -> MasterClient:
         """Return the connection to the master, opened on first use."""
-        deadline = time.monotonic() + _FIND
+        deadline = clocks.boot_time() + _FIND
         while self._client is None:
             self._check_parts()
             try:
@@ -185,7 +185,7 @@ class LocalCluster:
                     self.ros, name="local cluster", security=self.cluster.security
                 )
             except NoMaster:
-                if time.monotonic() >= deadline:
+                if clocks.boot_time() >= deadline:
                     raise
         return self._client
 
@@ -198,12 +198,12 @@ class LocalCluster:
             TimeoutError: the condition did not hold in time; the message has `what` and the last
                 states.
         """
-        deadline = time.monotonic() + timeout
+        deadline = clocks.boot_time() + timeout
         while True:
             view = self.client.list(hosts=True, processes=True)
             if condition(view):
                 return view
-            if time.monotonic() >= deadline:
+            if clocks.boot_time() >= deadline:
                 raise TimeoutError(f"{what} did not come about in {timeout:g} s: {_brief(view)}")
             self._check_parts()
             self.client.spin(_LOOK)
@@ -303,10 +303,10 @@ def _send(pids: Iterable[int], number: signal.Signals) -> None:
 def _end_all(parts: Sequence[Part]) -> None:
     for part in parts:
         part.end()
-    deadline = time.monotonic() + _END
+    deadline = clocks.boot_time() + _END
     for part in parts:
         try:
-            part.process.wait(max(0.1, deadline - time.monotonic()))
+            part.process.wait(max(0.1, deadline - clocks.boot_time()))
         except subprocess.TimeoutExpired:
             part.end(signal.SIGKILL)
             part.process.wait(5.0)

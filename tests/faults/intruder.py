@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import time
 from array import array
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
 from rclpy._rclpy_pybind11 import RCLError
 
+from rosrm import clocks
 from rosrm.keys import key_files
 from rosrm.keys.cluster import ClusterSecret, PrincipalKey, own_grant
 from rosrm.keys.derivation import KEY_BYTES
@@ -135,8 +135,8 @@ class Intruder:
 
     def spin(self, seconds: float) -> None:
         """Handle messages for some seconds."""
-        until = time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0.0:
+        until = clocks.boot_time() + seconds
+        while (left := until - clocks.boot_time()) > 0.0:
             self.participant.spin(left)
 
     def wait(self, condition: Callable[[], Any], what: str) -> Any:
@@ -209,7 +209,7 @@ class Intruder:
         client.peer = peer
         if hasattr(request, "envelope"):
             of_slave = service.startswith(path("host/"))
-            beat = time.monotonic_ns() if of_slave else self.beat.beat
+            beat = clocks.boot_time_ns() if of_slave else self.beat.beat
             request.envelope = self.control.envelope(beat, 2**62 if of_slave else self.beat.epoch)
         return client.call_async(request)
 
@@ -220,15 +220,15 @@ class Intruder:
 
     def answer(self, future: Any, seconds: float = 1.0) -> Any:
         """Return the answer to a request; None: none came in this time."""
-        until = time.monotonic() + seconds
-        while not future.done() and time.monotonic() < until:
+        until = clocks.boot_time() + seconds
+        while not future.done() and clocks.boot_time() < until:
             self.participant.spin(0.05)
         return future.result() if future.done() else None
 
     def answer_of_master(self, security: Any, name: str, request: Any) -> Any:
         """Return the answer of the master to a member, whose request may be repeated."""
-        until = time.monotonic() + PATIENCE
-        while time.monotonic() < until:
+        until = clocks.boot_time() + PATIENCE
+        while clocks.boot_time() < until:
             self.wait_for_beat()
             response = self.answer(self.ask_master(security, name, request))
             if response is not None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import itertools
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 import psutil
 
+from rosrm import clocks
 from rosrm.model.orders import FenceInstance, StartInstance, StopInstance
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -209,7 +209,7 @@ def registration(name: str) -> srv.RegisterHost.Request:
 def reading(**fields: int) -> bytes:
     """Return a reading of a host that is full."""
     record = Reading(
-        sequence=2**62, beat=time.monotonic_ns(), present=0b11, flags=1,
+        sequence=2**62, beat=clocks.boot_time_ns(), present=0b11, flags=1,
         usage=RESOURCE_SLOTS * (0.99,), limit=RESOURCE_SLOTS * (1.0,),
     )  # fmt: skip
     return encode(replace(record, **fields))

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any, Generic
 
+from rosrm import clocks
 from rosrm.keys.finding import host_security, master_security, user_security
 from rosrm.keys.security import UNKNOWN_RUN, Authority, Member, Peer
 from rosrm.ros import names
@@ -39,7 +39,7 @@ class Player(Generic[SecurityT]):
         """Return a client of a discovered service of the peer."""
         if name not in self._clients:
             client = self.endpoints.client(kind, name, self._peer, first_contact=True)
-            assert wait_for_service(self.participant, client, time.monotonic() + PATIENCE), name
+            assert wait_for_service(self.participant, client, clocks.boot_time() + PATIENCE), name
             self._clients[name] = client
         return self._clients[name]
 
@@ -48,11 +48,11 @@ class Player(Generic[SecurityT]):
 
         The first answer names the run of the peer, and any later request is for that run.
         """
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
+        deadline = clocks.boot_time() + PATIENCE
+        while clocks.boot_time() < deadline:
             is_first = self._peer.run == UNKNOWN_RUN and kind is not srv.Handshake
             future = self.client(kind, name).call_async(request)
-            response = answer_to(self.participant, future, time.monotonic() + 2.0)
+            response = answer_to(self.participant, future, clocks.boot_time() + 2.0)
             if response is not None and not is_first:
                 return response
         raise AssertionError(f"no answer of {name}")

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from typing import Any
 import pytest
 from std_msgs.msg import String
 
+from rosrm import clocks
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros.participant import Participant
 from rosrm.testing.local_cluster import claim_domain
@@ -48,7 +48,7 @@ class Loader:
         client = self.clients[service]
         assert client.wait_for_service(PATIENCE), f"{service} is not offered"
         future = client.call_async(of.Request(**fields))
-        return answer_to(self.participant, future, time.monotonic() + PATIENCE)
+        return answer_to(self.participant, future, clocks.boot_time() + PATIENCE)
 
     def load(self, component: str, **fields: Any) -> Any:
         return self.ask("LoadNode", "load_node", plugin_name=f"{COMPONENTS}:{component}", **fields)

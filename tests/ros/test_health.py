@@ -6,12 +6,12 @@ import os
 import re
 import signal
 import sys
-import time
 from dataclasses import replace
 
 import pytest
 from std_msgs.msg import Int64, String
 
+from rosrm import clocks
 from rosrm.core.slave.watches import NoState, Watch
 from rosrm.model.values import Health, MigrationPolicy, RestartPolicy
 from rosrm.ros.slave.graph import GraphWatch
@@ -237,10 +237,10 @@ class Listener:
     def __init__(self, stage, rate: float) -> None:
         self.node = stage.plain
         watch = Watch(Health("/scan", rate, "", SOON), ("/scan",))
-        self.ear = HealthMonitor(self.node, GraphWatch(self.node), watch, time.monotonic())
+        self.ear = HealthMonitor(self.node, GraphWatch(self.node), watch, clocks.boot_time())
 
     def look(self) -> tuple[int | None, str]:
-        return self.ear.topic((os.getpid(),), time.monotonic())
+        return self.ear.topic((os.getpid(),), clocks.boot_time())
 
     def look_until(self, condition, what: str) -> tuple[int | None, str]:
         looks = []
@@ -312,9 +312,9 @@ def test_another_type_is_followed(stage) -> None:
 def test_a_name_that_is_none_harms_nobody(stage) -> None:
     """The slave reports an invalid topic name and keeps running."""
     watch = Watch(Health("no topic", 1.0, "active", SOON), ("/no topic",), ("/no-node/get_state",))
-    ear = HealthMonitor(stage.plain, GraphWatch(stage.plain), watch, time.monotonic())
-    heard, trouble = ear.topic((1,), time.monotonic())
+    ear = HealthMonitor(stage.plain, GraphWatch(stage.plain), watch, clocks.boot_time())
+    heard, trouble = ear.topic((1,), clocks.boot_time())
     assert heard is None
     assert "cannot be listened to" in trouble
-    assert ear.state(time.monotonic() + 60.0) is NoState.NO_ANSWER
+    assert ear.state(clocks.boot_time() + 60.0) is NoState.NO_ANSWER
     ear.close()

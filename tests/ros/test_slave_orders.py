@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 
 import pytest
 
+from rosrm import clocks
 from rosrm.model.orders import StartInstance
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
 from rosrm.ros import convert, names
@@ -49,7 +49,7 @@ class Orders:
         return self._ask(start_to_msg(StartInstance(assignment), journal=0))
 
     def _ask(self, request: srv.ControlHost.Request):
-        request.envelope = self._master.control.envelope(time.monotonic_ns(), EPOCH)
+        request.envelope = self._master.control.envelope(clocks.boot_time_ns(), EPOCH)
         return self._master.ask(srv.ControlHost, path.of_host("h0", names.CONTROL), request).answer
 
 

@@ -16,6 +16,7 @@ from typing import Final
 from rich.console import Console
 from rich.live import Live
 
+from rosrm import clocks
 from rosrm.cli.output import tables, top
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.model.rows import Listing
@@ -103,7 +104,7 @@ class _LiveView:
         self._snapshot = snapshot
         self._sort = sort
         self._note = ""
-        self._answered = time.monotonic()
+        self._answered = clocks.boot_time()
 
     def draw(self) -> None:
         """Draw the newest listing."""
@@ -128,13 +129,13 @@ class _LiveView:
         except NoMaster:
             self._note = self._note or "the master does not answer"
             return
-        self._note, self._answered = "", time.monotonic()
+        self._note, self._answered = "", clocks.boot_time()
 
     def _wait(self, seconds: float) -> None:
         """Show a silence of a second or more, and react to keys."""
         before = (self._note, self._sort)
         if self._note or seconds >= _SILENCE:
-            silence = duration(time.monotonic() - self._answered)
+            silence = duration(clocks.boot_time() - self._answered)
             self._note = f"the master has not answered for {silence}"
         self.await_key(0.0)
         if (self._note, self._sort) != before:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from math import inf
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rclpy.qos import QoSProfile
 
+from rosrm import clocks
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.buffer import HISTORY, Known
 from rosrm.node.handoff.channel import Channel
@@ -177,7 +177,7 @@ class Destination:
                 return
             is_genuine = take(data)
             if self._catch_up() or is_genuine:
-                self._last_report = time.monotonic()
+                self._last_report = clocks.boot_time()
                 self._go_on()
 
     def _catch_up(self) -> bool:
@@ -204,7 +204,7 @@ class Destination:
             self._end(HandoffReport.FAILED, fault)
         elif self._assembler is not None:
             self._run = mark.run
-            if not self._assembler.add_mark(mark, time.monotonic()):
+            if not self._assembler.add_mark(mark, clocks.boot_time()):
                 self._end(HandoffReport.FAILED, "too many marks came without the state they name")
 
     def _fault_of(self, mark: StateMark) -> str:
@@ -272,7 +272,7 @@ class Destination:
 
     def _ask_for_history(self) -> None:
         """Repeat the last report if marks are missing: the source answers with a whole one."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         if self._channel is None or now - self._asked_at < _ASKED:
             return
         if self._entities.input_known(Known.GAP):
@@ -314,7 +314,7 @@ class Destination:
             return "for the source to answer: is it up, and does it use rosrm.node?"
         if self._cut is None:
             return self._missing_state()
-        now = time.monotonic()
+        now = clocks.boot_time()
         missing = self._missing_peers(self._cut.mark)
         if missing:
             self._matched_at = inf
@@ -379,7 +379,7 @@ class Destination:
 
     def _take_over_when_quiet(self) -> None:
         """Become active after the source's end, when its last messages have arrived."""
-        if time.monotonic() - self._last_report < _QUIET:
+        if clocks.boot_time() - self._last_report < _QUIET:
             return
         if self._cut is None:
             self._end(HandoffReport.FAILED, "the source ended before a state of it was here")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from typing import Any, Final, NamedTuple
 
+from rosrm import clocks
 from rosrm.ros.names import is_slave_node
 
 #: Seconds after which the slaves among the readers are counted again. Their names may arrive later
@@ -34,7 +34,7 @@ class ReaderCount:
 
     def of(self, output: Any) -> int:
         """Return the number of matched readers of an output that belong to no slave."""
-        matched, now = int(output.get_subscription_count()), time.monotonic()
+        matched, now = int(output.get_subscription_count()), clocks.boot_time()
         if not matched:
             return 0
         counted = self._counted.get(output.topic_name)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.node.steady_timer import steady_timer
 
 #: Seconds of one slice; a callback that has begun is finished.
@@ -52,7 +52,7 @@ class InputReplay:
         next message it would delay that message.
         """
         self._beside, self._is_idle = beside, False
-        self._spread_until = time.monotonic() + _MOST_SPREAD
+        self._spread_until = clocks.boot_time() + _MOST_SPREAD
         self._end_pause()
         self._pause = steady_timer(self._plain, _IDLE, self._become_idle)
         self._start()
@@ -61,7 +61,7 @@ class InputReplay:
         """Advance the further work by one step, unless a slice does so."""
         if self._pause is None or self._timer is not None or not self._advance():
             return
-        if time.monotonic() < self._spread_until:
+        if clocks.boot_time() < self._spread_until:
             self._pause.reset()
 
     def _become_idle(self) -> None:
@@ -96,7 +96,7 @@ class InputReplay:
             if self._timer is None:
                 return
             try:
-                more = self._serve_until(time.monotonic() + _SLICE)
+                more = self._serve_until(clocks.boot_time() + _SLICE)
             finally:
                 steps = self._advance()
             if not more or self._counted <= 0:
@@ -110,6 +110,6 @@ class InputReplay:
         """Serve messages until `end`; return True if more may be left."""
         while self._serve_next():
             self._counted -= 1
-            if self._counted == 0 or time.monotonic() >= end:
+            if self._counted == 0 or clocks.boot_time() >= end:
                 return True
         return False

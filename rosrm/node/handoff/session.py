@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
+from rosrm import clocks
 from rosrm.keys.names import instance_name
 from rosrm.node.handoff.destination import Destination
 from rosrm.node.handoff.source import HandoffSource
@@ -131,7 +131,7 @@ class HandoffSession:
             self._refuse(fault)
             return
         if self._is_early(config):
-            self._hold(config, time.monotonic() + _EARLY_FOR)
+            self._hold(config, clocks.boot_time() + _EARLY_FOR)
             return
         if self._early and config.epoch > self._epoch:
             self._look_at_early()  # earlier messages of the new master come first
@@ -191,7 +191,7 @@ class HandoffSession:
         for config, until in held:
             if not self._is_early(config):
                 self._configured(config)
-            elif time.monotonic() < until:
+            elif clocks.boot_time() < until:
                 self._early.append((config, until))
             else:
                 self._refuse(

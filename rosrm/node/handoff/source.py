@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import random
-import time
 from array import array
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from rclpy.duration import Duration
 
+from rosrm import clocks
 from rosrm.node.handoff import channel as topics
 from rosrm.node.handoff.channel import Channel
 from rosrm.node.handoff.state_parts import StateError, StateTopic
@@ -138,7 +138,7 @@ class HandoffSource:
 
     def _still_due(self) -> list[int]:
         """Return the timers' due times less the time that saving a large state has taken."""
-        passed = int((time.monotonic() - self._silent_since) * 1e9)
+        passed = int((clocks.boot_time() - self._silent_since) * 1e9)
         return [due if due < 0 else max(0, due - passed) for due in self._timers_due]
 
     # --- a handoff -------------------------------------------------------------------------
@@ -239,7 +239,7 @@ class HandoffSource:
         if self._channel is None or not wanted or self._fault:
             return  # the handoff was aborted
         self._timers_due = entities.fall_silent()
-        self._silent_since = time.monotonic()
+        self._silent_since = clocks.boot_time()
         if not self._show(whole=True, last=True):
             self._reactivate(lambda: None)  # the failure has been reported
             return
@@ -254,7 +254,7 @@ class HandoffSource:
         """
         with self._entities.turn:
             received = all(one.wait_for_all_acked(_AT_ONCE) for one in self._entities.outputs)
-            if received or time.monotonic() - self._silent_since >= _ACK_PATIENCE:
+            if received or clocks.boot_time() - self._silent_since >= _ACK_PATIENCE:
                 self._stop_release()
                 if self._channel is not None:
                     self._channel.report(HandoffReport.RELEASED, self._entities.sequence)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part, size_fault
 from rosrm.node.identity import NodeIdentity
 from rosrm.node.managed_node import NodeEntities
@@ -56,14 +56,14 @@ class SnapshotRestore:
         self._parts = parts
         self._snapshot = snapshot
         self._done = done
-        self._give_up = time.monotonic() + _PATIENCE
+        self._give_up = clocks.boot_time() + _PATIENCE
         self._timer = steady_timer(entities.plain, 0.0, self._restore)
 
     def _restore(self) -> None:
         with self._entities.turn:
             plain = self._entities.plain
             plain.destroy_timer(self._timer)
-            if self._is_incomplete() and time.monotonic() < self._give_up:
+            if self._is_incomplete() and clocks.boot_time() < self._give_up:
                 self._timer = steady_timer(plain, _LOOK, self._restore)
                 return
             try:
@@ -120,7 +120,7 @@ class SnapshotRestore:
         entities.cover(mark.inputs)
         entities.inherit(mark.inputs)
         try:
-            entities.become_active(mark.timers_due, time.monotonic(), self._announce)
+            entities.become_active(mark.timers_due, clocks.boot_time(), self._announce)
         finally:
             self._done()
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import atexit
 import threading
-import time
 import zlib
 from array import array
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from typing import Any, Final
 
 from rclpy.serialization import serialize_message
 
+from rosrm import clocks
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
@@ -63,7 +63,7 @@ class SnapshotSaver:
 
     def after_cycle(self) -> None:
         """Save the state after a cycle, or schedule a later save."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         if now >= self._next:
             self._keep(now)
         elif not self._armed:
@@ -78,7 +78,7 @@ class SnapshotSaver:
             self._armed = False
             self._late.cancel()
             if self._may_keep():
-                self._keep(time.monotonic())
+                self._keep(clocks.boot_time())
 
     def _may_keep(self) -> bool:
         """Return True if the state is new, and lies between two cycles of an active node."""
@@ -97,7 +97,7 @@ class SnapshotSaver:
             return
         self._kept = self._entities.sequence
         self._writer.put(self._kept, blocks)
-        cost = time.monotonic() - now
+        cost = clocks.boot_time() - now
         self._next = now + min(self._every, cost / _SHARE)
 
     def _blocks(self) -> list[Block]:
@@ -151,7 +151,7 @@ class SnapshotSaver:
         if self._entities.turn.acquire(timeout=_CLOSE_PATIENCE):
             try:
                 if self._may_keep():
-                    self._keep(time.monotonic())
+                    self._keep(clocks.boot_time())
             finally:
                 self._entities.turn.release()
         self._writer.close()

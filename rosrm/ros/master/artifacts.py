@@ -6,7 +6,6 @@ the loop, at most `max_rate` bytes a second, so that it has time for readings.
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections import deque
 from collections.abc import Callable
@@ -14,6 +13,7 @@ from collections.abc import Set as AbstractSet
 from functools import partial
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.artifacts.store import ArtifactStore
 from rosrm.errors import Refused, describe_fault
 from rosrm.keys.security import Authority
@@ -48,7 +48,7 @@ class ArtifactServices:
         self._worker = worker
         self._keep = keep
         self._rate = max_rate
-        self._budget, self._budget_at = max_rate / 10.0, time.monotonic()
+        self._budget, self._budget_at = max_rate / 10.0, clocks.boot_time()
         #: Bytes and beginning of each part that waits for the rate, and all these bytes.
         self._waiting: deque[tuple[int, Callable[[], None]]] = deque()
         self._queued = 0
@@ -93,7 +93,7 @@ class ArtifactServices:
         else:
             self._queued += size
             self._waiting.append((size, partial(self._worker.run, work, then, refuse)))
-            self.advance(time.monotonic())
+            self.advance(clocks.boot_time())
 
     def advance(self, now: float) -> None:
         """Begin with the parts that the rate allows; called several times a second."""

@@ -12,10 +12,10 @@ Its parts are in files of their own:
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Sequence
 from typing import Final
 
+from rosrm import clocks
 from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.keys.security import Authority
@@ -102,7 +102,7 @@ class MasterEndpoint:
     def poll_readings(self) -> None:
         """Take new readings, even when no other event occurs; called in every tick."""
         self._guard.call(self._take_readings)
-        self._oldest.append(self.links.reading_stats.ages(time.monotonic())[1])
+        self._oldest.append(self.links.reading_stats.ages(clocks.boot_time())[1])
 
     def poll_first_readings(self) -> None:
         """Take new readings if requests of slaves wait for them; called once before `take_events`.
@@ -147,7 +147,7 @@ class MasterEndpoint:
             msg.MasterBeat(
                 protocol_version=PROTOCOL_VERSION, name=identity.name, hostname=identity.hostname,
                 pid=identity.pid, epoch=identity.epoch, incarnation=identity.incarnation,
-                beat=time.monotonic_ns(), uptime=uptime, journal=journal,
+                beat=clocks.boot_time_ns(), uptime=uptime, journal=journal,
                 tickets_from=ticket_version(identity.epoch, self._security),
                 silent_hosts=list(silent_hosts),
             )
@@ -159,7 +159,7 @@ class MasterEndpoint:
     def _publish_load(self, uptime: float) -> None:
         """Publish statistics that show if the master keeps up with its slaves' messages."""
         stats = self.links.reading_stats
-        hosts, _ = stats.ages(time.monotonic())
+        hosts, _ = stats.ages(clocks.boot_time())
         oldest, self._oldest = self._oldest, []
         facts = {
             "hosts": hosts, "cycles": stats.cycles, "missed": stats.missed,
@@ -168,7 +168,7 @@ class MasterEndpoint:
         }  # fmt: skip
         self._loads.publish(
             msg.Event(
-                wall_time=time.time(), elapsed=uptime, kind="load", data=json.dumps(facts),
+                wall_time=clocks.wall_time(), elapsed=uptime, kind="load", data=json.dumps(facts),
                 message=f"{hosts} hosts report, {stats.missed} of "
                 f"{stats.cycles + stats.missed} cycles were missed, the oldest reading is "
                 f"{max(oldest, default=0.0):.2f} s old",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
@@ -11,6 +10,7 @@ from typing import Any, Final
 
 from rclpy.serialization import serialize_message
 
+from rosrm import clocks
 from rosrm.core.master.commands import PublishStateConfig
 from rosrm.core.master.events import Event, HandoffReported, SourceStranded
 from rosrm.keys.handoffs import HandoffKeys, new_link
@@ -94,7 +94,7 @@ class HandoffEndpoint:
         self._handoffs: dict[str, _Handoff] = {}
         self._askers: OrderedDict[tuple[str, int], _Asker] = OrderedDict()
         self._questions_left = float(_QUESTIONS)
-        self._questions_at = time.monotonic()
+        self._questions_at = clocks.boot_time()
         participant.node.create_subscription(
             msg.Sealed, self._names.stranded_sources,
             participant.counted(self._take_question), qos.HANDOFF, raw=True,
@@ -186,7 +186,7 @@ class HandoffEndpoint:
         report = self._question_in(data)
         if report is None:
             return
-        now = time.monotonic()
+        now = clocks.boot_time()
         new = (now - self._questions_at) * _QUESTIONS_PER_SECOND
         self._questions_left = min(float(_QUESTIONS), self._questions_left + new)
         self._questions_at = now

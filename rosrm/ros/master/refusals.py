@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Final, Literal
 
+from rosrm import clocks
 from rosrm.core.master import events as happened
 
 #: Kind of a refused message. A sender chooses its own name, but not the kind.
@@ -30,7 +30,7 @@ class Refusals:
 
     def __call__(self, kind: Kind, who: str, reason: str) -> None:
         """Record a refusal, or count it if one of its kind was recorded a moment ago."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         recorded_at, others = self._recorded.get(kind, (-math.inf, 0))
         if now - recorded_at < _RECORD_PERIOD:
             self._recorded[kind] = (recorded_at, others + 1)

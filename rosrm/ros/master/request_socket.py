@@ -7,9 +7,9 @@ import logging
 import queue
 import socket
 import threading
-import time
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.keys.security import Authority
 from rosrm.ros import master_socket
 from rosrm.ros.sealed import SealedEndpoints
@@ -69,7 +69,7 @@ class RequestSocket:
                     _log.exception("a request on the socket of this machine has failed")
 
     def _serve(self, connection: socket.socket) -> None:
-        until = time.monotonic() + _TRANSFER
+        until = clocks.boot_time() + _TRANSFER
         content = master_socket.receive(connection, master_socket.MOST_REQUEST, until)
         service, envelope = master_socket.service_and_envelope(content)
         take = self._endpoints.handlers.get(service)
@@ -78,7 +78,7 @@ class RequestSocket:
             # Queued behind earlier messages: a repetition over DDS must be opened after this one.
             self._endpoints.participant.post(take, envelope, answers.put)
             answer = encode(answers.get(timeout=_DECISION))
-            master_socket.send(connection, answer, time.monotonic() + _TRANSFER)
+            master_socket.send(connection, answer, clocks.boot_time() + _TRANSFER)
 
     def __enter__(self) -> Self:
         return self

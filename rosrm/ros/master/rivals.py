@@ -8,10 +8,10 @@ beat, and counts only a master that answers with the same run.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from typing import Final
 
+from rosrm import clocks
 from rosrm.keys.security import Authority, Member
 from rosrm.model.durations import LONGEST
 from rosrm.ros import names
@@ -62,7 +62,7 @@ class RivalWatch:
         if fault:
             self._refuse(f"master {beat.name}", fault)
             return
-        now = time.monotonic()
+        now = clocks.boot_time()
         self._newest = beat
         if now >= self._ask_at:
             self._ask_at = now + _PATIENCE

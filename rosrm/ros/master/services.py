@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Final, Protocol
 
+from rosrm import clocks
 from rosrm.config.settings import ControlSettings
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
@@ -197,7 +197,7 @@ class MasterServices:
         return response
 
     def _submitted(self, request: srv.Submit.Request, token: int, peer: Peer) -> happened.Event:
-        received = time.time_ns()
+        received = clocks.wall_time_ns()
         specs = self._specs(request.processes)
         specs = tuple(stamped_spec(spec, master_received=received) for spec in specs)
         return happened.SubmissionReceived(token, specs, _requester(peer))
@@ -277,7 +277,7 @@ class MasterServices:
                 protocol_version=PROTOCOL_VERSION, software_version=__version__,
                 accepted=not fault, message=fault, master=self._identity.name,
                 hostname=self._identity.hostname, pid=self._identity.pid,
-                epoch=self._identity.epoch, beat=time.monotonic_ns(),
+                epoch=self._identity.epoch, beat=clocks.boot_time_ns(),
             )
         )  # fmt: skip
 
@@ -371,7 +371,7 @@ class MasterServices:
         # The expiry of the ticket needs the slave's clock, which is in the first reading.
         self._links.introduce_after_first_reading(
             link, lambda: open_request.answer(self._introduction(request, sender, link, first)),
-            time.monotonic() + _FIRST_READING, lambda _: refuse(silent),
+            clocks.boot_time() + _FIRST_READING, lambda _: refuse(silent),
         )  # fmt: skip
 
     def _introduction(

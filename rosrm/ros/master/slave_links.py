@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Withdraw
 from rosrm.errors import Refused
@@ -107,7 +107,7 @@ class HostLink:
 
     def search(self) -> None:
         """Require that DDS discovers the slave's service before the next order."""
-        self.is_discovered, self.searched_from = False, time.monotonic()
+        self.is_discovered, self.searched_from = False, clocks.boot_time()
 
     def close_poll(self) -> None:
         """Close the open request: it is answered, or its answer can reach no slave."""
@@ -180,7 +180,7 @@ class HostLinks:
         """
         link = self._links.get(host_id)
         peer.run = run
-        slave = RegisteredSlave.of(peer, run, self._readings, time.monotonic())
+        slave = RegisteredSlave.of(peer, run, self._readings, clocks.boot_time())
         if link is None or link.slave is None or link.slave.peer is not peer:
             link = self._new_link(host_id, description.name, slave)
             self._links[host_id] = link
@@ -241,7 +241,7 @@ class HostLinks:
     @property
     def awaits_first_readings(self) -> bool:
         """Return True if orders or requests wait for a slave that registered a moment ago."""
-        return bool(self._waiting) and time.monotonic() < self._first_readings_until
+        return bool(self._waiting) and clocks.boot_time() < self._first_readings_until
 
     def reading_received(self, host_ids: Iterable[int]) -> None:
         """Send the orders that waited for readings of these hosts."""
@@ -287,7 +287,7 @@ class HostLinks:
     def assign(self, command: Assign) -> None:
         """Keep an assignment for `flush`."""
         assignment = stamped_assignment(
-            command.assignment, decided=self.decided_at, journalled=time.time_ns()
+            command.assignment, decided=self.decided_at, journalled=clocks.wall_time_ns()
         )
         self._links[command.host_id].outbox.append(assignment)
         self._with_work.add(command.host_id)
@@ -321,7 +321,7 @@ class HostLinks:
     def _start(self, link: HostLink, assignment: Assignment, journal: int) -> None:
         """Order the start of an assignment; the request for work stays open."""
         request = start_to_msg(StartInstance(assignment), journal)
-        deadline = time.monotonic() + self._order_timeout
+        deadline = clocks.boot_time() + self._order_timeout
         self._send(link, request, deadline, partial(_log_refusal, link, assignment))
 
     def _answer_poll(
@@ -338,7 +338,7 @@ class HostLinks:
         )  # fmt: skip
 
     def _as_sent(self, assignment: Assignment) -> Assignment:
-        return stamped_assignment(self._keyed(assignment), assignment_sent=time.time_ns())
+        return stamped_assignment(self._keyed(assignment), assignment_sent=clocks.wall_time_ns())
 
     def withdraw(self, command: Withdraw, now: float) -> None:
         """Remove an assignment that was not yet fetched, or order its end."""
@@ -402,7 +402,7 @@ class HostLinks:
     def _is_discovered(self, link: HostLink) -> bool:
         """Return True if an order need not wait until DDS discovers the slave's service."""
         if not link.is_discovered:
-            had_time = time.monotonic() - link.searched_from >= _DISCOVERY
+            had_time = clocks.boot_time() - link.searched_from >= _DISCOVERY
             link.is_discovered = had_time or link.control.service_is_ready()
         return link.is_discovered
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from typing import Final
 
+from rosrm import clocks
 from rosrm.ros.master.refusals import Refuse
 from rosrm.wording import counted, duration
 
@@ -36,7 +36,7 @@ class Strangers:
 
     def note(self, topic: str, number: int = 1) -> None:
         """Count messages on a topic or service, or on all topics of a host."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         count = self._counts.setdefault(topic, _Count())
         count.total += number
         count.unrecorded += number
@@ -56,7 +56,7 @@ class Strangers:
 
     def sentence(self) -> str:
         """Return a sentence about the messages of the last hour; "": there was none."""
-        now = time.monotonic()
+        now = clocks.boot_time()
         shown = {name: one for name, one in self._counts.items() if now - one.last < _SHOWN}
         if not shown:
             return ""

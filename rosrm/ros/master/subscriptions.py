@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
 
+from rosrm import clocks
 from rosrm.core.master import events as happened
 from rosrm.errors import Refused
 from rosrm.keys.security import Authority, Peer
@@ -66,13 +66,13 @@ class SlaveSubscriptions:
             plain = open_reading(sealed, run, slave_of)
             if plain is not None:
                 taken.append(plain)
-            elif not may_be_of_former_run(sealed, slave_of, time.monotonic()):
+            elif not may_be_of_former_run(sealed, slave_of, clocks.boot_time()):
                 self._endpoints.refused(self._topic)
         if not taken:
             return None
         batch = decode(taken)
         if batch.runs is not None:
-            received = self._links.reading_stats.take(batch.runs, time.monotonic())
+            received = self._links.reading_stats.take(batch.runs, clocks.boot_time())
             self._links.reading_received(received.tolist())
         for refusal in batch.refusals:
             self._refuse("resource_info", "resource_info", refusal)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import time
 from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from typing import Final
 
 from rclpy.duration import Duration
 
+from rosrm import clocks
 from rosrm.core.slave import events
 from rosrm.core.slave.master_clock import BeatClock
 from rosrm.core.slave.state import SlaveState
@@ -216,7 +216,7 @@ class SlaveEndpoint:
         )  # fmt: skip
 
     def _take_greeting(self, answer: srv.Handshake.Response | None, asked_at: float) -> None:
-        now = time.monotonic()
+        now = clocks.boot_time()
         if self.link is not MasterLink.GREETING:
             return  # another of the repeated requests was answered first
         if answer is None or now - asked_at >= _PATIENCE:  # this process was stopped
@@ -247,16 +247,16 @@ class SlaveEndpoint:
             journal_seen=self._seen.of_former_run(self.cluster, beat.incarnation),
         )
         self._incarnation = beat.incarnation
-        self._asked_at = time.monotonic()
+        self._asked_at = clocks.boot_time()
         self.link = MasterLink.REGISTERING
         self._poll_at = 0.0
         self._control.call(
-            self._clients[srv.RegisterHost], request, time.monotonic() + _PATIENCE,
+            self._clients[srv.RegisterHost], request, clocks.boot_time() + _PATIENCE,
             self._take_registration,
         )  # fmt: skip
 
     def _take_registration(self, response: srv.RegisterHost.Response | None) -> None:
-        now = time.monotonic()
+        now = clocks.boot_time()
         if response is None or response.answer.code == "stale":
             self.link = MasterLink.SEARCHING
             return
@@ -338,7 +338,7 @@ class SlaveEndpoint:
     def _take_beat(self, beat: msg.MasterBeat, _run: bytes) -> None:
         if version_refusal(beat.protocol_version, "the master"):
             return  # the handshake reports the version mismatch
-        now = time.monotonic()
+        now = clocks.boot_time()
         if self.link is MasterLink.REGISTERED and beat.incarnation != self._incarnation:
             if not self._missed(_MISSED_BY_ANOTHER, now):
                 return
@@ -417,11 +417,11 @@ class SlaveEndpoint:
     def _take_work(self, response: srv.RequestProcess.Response | None) -> None:
         if response is None:
             return  # the request was renewed, and the former one was lost
-        received = time.time_ns()
+        received = clocks.wall_time_ns()
         self._poll_at, self._poll_again = 0.0, _POLL_AGAIN
         answer = response.answer
         if not answer.accepted:
-            self._poll_at = time.monotonic() + _ASK_AGAIN  # not in every round of the loop
+            self._poll_at = clocks.boot_time() + _ASK_AGAIN  # not in every round of the loop
             if answer.code in ("unknown", "stale"):
                 self._lose_master(f"the master does not know this host any more: {answer.message}")
             return
@@ -549,5 +549,5 @@ class SlaveEndpoint:
             left_running=[convert.status_to_msg(status) for status in running],
         )  # fmt: skip
         self._control.call(
-            self._clients[srv.Leave], request, time.monotonic() + 1.0, lambda _: done()
+            self._clients[srv.Leave], request, clocks.boot_time() + 1.0, lambda _: done()
         )

@@ -19,6 +19,7 @@ from typing import Any, Final
 
 from rclpy.node import Node
 
+from rosrm import clocks
 from rosrm.model.links import MOST_FLOWS
 from rosrm.model.values import LARGEST_RATE
 from rosrm.ros import qos
@@ -81,7 +82,7 @@ class FlowSampler:
     """
 
     def __init__(
-        self, node: Callable[[], Node], clock: Callable[[], float] = time.monotonic,
+        self, node: Callable[[], Node], clock: Callable[[], float] = clocks.boot_time,
         cpu: Callable[[], float] = time.process_time,
     ) -> None:  # fmt: skip
         self._make_node, self._clock, self._cpu = node, clock, cpu

@@ -14,6 +14,7 @@ from typing import Any, Final
 import rclpy
 from rclpy.node import Node
 
+from rosrm import clocks
 from rosrm.ros import qos
 from rosrm.ros.polling import message_type, polled_subscription, waiting
 
@@ -42,7 +43,7 @@ def await_second_publisher(
         TimeoutError: the message describes the messages received instead.
         ValueError: another node publishes there too, or there is no such type.
     """
-    begun = time.monotonic()
+    begun = clocks.boot_time()
     kind = _type_of(type_name)
     context = rclpy.Context()
     context.init(initialize_logging=False)
@@ -55,7 +56,7 @@ def await_second_publisher(
             names = frozenset((source, destination))
             received, both = _listen(node, topic, kind, names, begun + timeout)
             if both:
-                return {"heard": received, "seconds": time.monotonic() - begun}
+                return {"heard": received, "seconds": clocks.boot_time() - begun}
             reason = _missing(node, topic, type_name, received)
         finally:
             node.destroy_node()
@@ -70,7 +71,7 @@ def _listen(
     """Return the number of messages received, and True if they came from both publishers."""
     subscription = polled_subscription(node, kind, topic, _ANY)
     received, last, two = 0, 0, False
-    while time.monotonic() < deadline:
+    while clocks.boot_time() < deadline:
         for _, info in waiting(subscription):
             received += 1
             count = int(info["publication_sequence_number"])

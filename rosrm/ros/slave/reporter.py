@@ -8,11 +8,11 @@ message, after at most one beat period of the master, so both sides hear from ea
 
 from __future__ import annotations
 
-import time
 from array import array
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from rosrm import clocks
 from rosrm.ros.reading_codec import MOST_QUIET, Reading, encode, flags
 
 #: Part of a resource's capacity by which a usage must have moved to be published at once.
@@ -84,7 +84,7 @@ class Reporter:
         one = self._reading
         accepting, one.processes, one.present, one.stale, one.status_sequence = self._facts
         one.flags = flags(accepting=accepting, quiet=self._unpublished - 1)
-        one.beat = time.monotonic_ns()
+        one.beat = clocks.boot_time_ns()
         self._unpublished = 0
         self._published = self._facts
         self._published_usage, self._published_limit = one.usage, one.limit

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
+from rosrm import clocks
 from rosrm.core.slave.events import Event
 from rosrm.core.slave.orders import event_of
 from rosrm.errors import Refused
@@ -167,7 +167,7 @@ class SlaveServices:
 
     def _start(self, assignment: Assignment, request: srv.ControlHost.Request) -> None:
         self._endpoint.note_journal(journal_of(request), request.envelope.epoch)
-        assignment = stamped_assignment(assignment, slave_received=time.time_ns())
+        assignment = stamped_assignment(assignment, slave_received=clocks.wall_time_ns())
         given_at = request.envelope.receiver_beat / 1e9
         self._duties.take(event_of(StartInstance(assignment), given_at))
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+from rosrm import clocks
 from rosrm.artifacts.cache import ArtifactCache, Incoming, Used
 from rosrm.errors import Refused, describe_fault
 from rosrm.model.artifacts import Artifact
@@ -51,7 +51,7 @@ class Fetch:
         self._has_ended = self._waits = False
         self._writing = 0
         self._incoming: Incoming | None = None
-        self._progress_at = time.monotonic()
+        self._progress_at = clocks.boot_time()
         self._silence = "its service was not found"
         worker.run(partial(cache.begin, artifact, used), self._begun, self._failed)
 
@@ -87,7 +87,7 @@ class Fetch:
         self._incoming = incoming
         if self._has_ended:
             self._drop()
-        self.advance(time.monotonic())
+        self.advance(clocks.boot_time())
 
     def _answered(self, part: ArtifactPart | Refused | None) -> None:
         if self._has_ended:
@@ -97,7 +97,7 @@ class Fetch:
             self._silence = "it does not answer"
         elif isinstance(part, Refused) and part.code in _AGAIN:
             self._silence = str(part)
-            self._progress_at = time.monotonic()  # the master is alive
+            self._progress_at = clocks.boot_time()  # the master is alive
         elif isinstance(part, Refused):
             self._end(f"artifact {self.artifact.name!r} was not fetched: {part}")
         elif part.size != self.artifact.size or not part.data:
@@ -109,7 +109,7 @@ class Fetch:
             self._write(part.data)
 
     def _write(self, data: bytes) -> None:
-        incoming, now = self._incoming, time.monotonic()
+        incoming, now = self._incoming, clocks.boot_time()
         assert incoming is not None, "no part is requested before the archive is open"
         self.offset += len(data)
         self._progress_at = now
@@ -121,7 +121,7 @@ class Fetch:
 
     def _written(self, _: None) -> None:
         self._writing -= 1
-        self.advance(time.monotonic())
+        self.advance(clocks.boot_time())
 
     def _finished(self, _: None) -> None:
         self._incoming = None

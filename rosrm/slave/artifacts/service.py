@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.artifacts.cache import ArtifactCache
 from rosrm.errors import Refused, describe_fault
 from rosrm.model.artifacts import Artifact
@@ -43,7 +43,7 @@ class _Preparation:
     done: Done
     missing: list[Artifact] | None = None
     fetched: set[str] = field(default_factory=set)
-    reported_at: float = field(default_factory=time.monotonic)
+    reported_at: float = field(default_factory=clocks.boot_time)
 
 
 class ArtifactService:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, TypeVar
 
+from rosrm import clocks
 from rosrm.errors import LaunchError, PluginError, RosrmError
 from rosrm.extensions.answers import whole
 from rosrm.extensions.contracts import (
@@ -123,8 +123,8 @@ class Launchers:
         """Call one launcher, after its other calls; raises `PluginError` or `LaunchError`."""
         launcher: Any = self.made[name].launcher
         lock = self._locks.setdefault(name, threading.Lock())
-        began = self._since.get(name, time.monotonic())
-        if not lock.acquire(timeout=max(0.0, began + PREPARE_LIMIT - time.monotonic())):
+        began = self._since.get(name, clocks.boot_time())
+        if not lock.acquire(timeout=max(0.0, began + PREPARE_LIMIT - clocks.boot_time())):
             raise PluginError(
                 f"the launcher {name!r} fails: prepare: an earlier call has not ended"
             )
@@ -134,7 +134,7 @@ class Launchers:
             return None if prepared is None else _checked(launch, required(prepared, Launch))
 
         try:
-            self._since[name] = time.monotonic()
+            self._since[name] = clocks.boot_time()
             prepared = guarded(
                 ask, whom=titled("launcher", name), hook="prepare", seconds=PREPARE_LIMIT,
                 of=launcher, lets=(LaunchError, RosrmError, ValueError),

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Final
 
+from rosrm import clocks
 from rosrm.model.values import Assignment
 from rosrm.ros.slave.replication import NotSent, NotStored, ReplicationEndpoint
 from rosrm.snapshots.format import Head, TransferPart
@@ -45,7 +45,7 @@ class Fetch:
         self._has_ended = self._waits = False
         self._failures: list[str] = []
         self._wanted = TransferPart(assignment.spec.name, 0, 0, 0, 0, 0, b"")
-        now = time.monotonic()
+        now = clocks.boot_time()
         self._deadline, self._host_by = now + LONGEST, now + PATIENCE
 
     def cancel(self) -> None:
@@ -71,7 +71,7 @@ class Fetch:
     def _answered(self, part: TransferPart | NotSent) -> None:
         if self._has_ended:
             return
-        now = time.monotonic()
+        now = clocks.boot_time()
         if isinstance(part, NotSent):
             self._next_host(part.message, now)
         elif part.number < self._assignment.snapshots_from or not part.data:
@@ -86,7 +86,7 @@ class Fetch:
     def _taken(self, part: TransferPart, refusal: NotStored | None) -> None:
         if self._has_ended:
             return
-        now = time.monotonic()
+        now = clocks.boot_time()
         if refusal is not None:
             self._next_host(refusal.message, now)
         elif part.is_last:

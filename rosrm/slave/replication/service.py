@@ -9,13 +9,13 @@ from __future__ import annotations
 import logging
 import queue
 import threading
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from rosrm import clocks
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
@@ -126,7 +126,7 @@ class ReplicationService:
         self._reported_at = 0.0
         self._next_scan = 0.0
         self._budget = float(settings.max_rate)
-        self._budget_at = time.monotonic()
+        self._budget_at = clocks.boot_time()
         threading.Thread(target=self._work, name="snapshots", daemon=True).start()
         endpoint.serve(self)
 
@@ -188,7 +188,7 @@ class ReplicationService:
     def report_again(self) -> None:
         """Report all snapshots to a master that has just registered this host."""
         self._reported = None
-        self._report(time.monotonic())
+        self._report(clocks.boot_time())
 
     # --- the loop ------------------------------------------------------------------------
 
@@ -223,7 +223,7 @@ class ReplicationService:
     def _scanned(self, states: tuple[SnapshotReport, ...] | None) -> None:
         if states is not None:
             self._snapshots = states
-            self._report(time.monotonic())
+            self._report(clocks.boot_time())
 
     def _report(self, now: float) -> None:
         quiet = not self._snapshots and not self._reported
@@ -262,7 +262,7 @@ class ReplicationService:
             return
         transfer.head, transfer.content, transfer.digest = found
         transfer.waits = False
-        self._send_part(transfer, time.monotonic())
+        self._send_part(transfer, clocks.boot_time())
 
     def _send_part(self, transfer: _Transfer, now: float) -> None:
         """Send the next part, as soon as the limit of the sending rate allows it."""
@@ -281,7 +281,7 @@ class ReplicationService:
 
     def _given(self, transfer: _Transfer, size: int, refusal: NotStored | None) -> None:
         shipment, head, host = transfer.shipment, transfer.head, transfer.host
-        now = time.monotonic()
+        now = clocks.boot_time()
         if refusal is not None and head is not None:
             self._not_taken(shipment, host, head, now, refusal)
             self._end(transfer)
@@ -398,7 +398,7 @@ class ReplicationService:
             assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
             here=found.head, take=self._take_fetched, ended=ended,
         )  # fmt: skip
-        fetch.advance(time.monotonic())
+        fetch.advance(clocks.boot_time())
 
     def _take_fetched(self, part: TransferPart, then: Callable[[NotStored | None], None]) -> None:
         self._in_thread(partial(self._store.take, part, bounded=False), then, _FAILED)

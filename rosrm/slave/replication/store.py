@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import time
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
@@ -84,7 +84,7 @@ class SnapshotStore:
     """
 
     def __init__(
-        self, root: Path, max_bytes: int, clock: Callable[[], float] = time.monotonic
+        self, root: Path, max_bytes: int, clock: Callable[[], float] = clocks.boot_time
     ) -> None:
         self._root = root
         self._max_bytes = max_bytes

@@ -7,12 +7,12 @@ import signal
 import subprocess
 import sys
 import textwrap
-import time
 from pathlib import Path
 
 import pytest
 
 import rosrm
+from rosrm import clocks
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor.client_values import key_of
@@ -41,7 +41,7 @@ SLAVE = """
     ])
     pids = {}
     while True:
-        client.send(ContactReported(time.monotonic(), 0.0))
+        client.send(ContactReported(clocks.boot_time(), 0.0))
         for status in client.receive(0.1):
             if status.pid and status.instance.process not in pids:
                 pids[status.instance.process] = status.pid
@@ -76,9 +76,9 @@ def test_a_stopped_slave_cannot_fence_so_its_supervisor_does(host, slave):
     supervisor, one, driver = map(int, slave.stdout.readline().split())
     host.pids.add(supervisor)
     os.kill(slave.pid, signal.SIGSTOP)
-    stopped = time.monotonic()
+    stopped = clocks.boot_time()
     wait_gone(one)
-    took = time.monotonic() - stopped
+    took = clocks.boot_time() - stopped
     assert 1.5 < took < PATIENCE / 2, took  # the last renewal was 0.1 s before, on a quiet machine
     assert alive(driver)
     slave.kill()
@@ -93,16 +93,16 @@ def test_an_alive_fence_is_renewed_by_the_running_slave_alone(host, client):
     fences = {"one": Fence(4.0, 0.0, alive=True), "two": Fence(4.0, 0.0)}
     client.start([host.order(name, "sleep", "1000", fence=fence) for name, fence in fences.items()])
     host.running(client, "one")
-    until, ended = time.monotonic() + PATIENCE, set()
+    until, ended = clocks.boot_time() + PATIENCE, set()
     while not ended:
-        alive = time.monotonic()
+        alive = clocks.boot_time()
         assert alive < until, "no instance was fenced"
         client.send(ContactReported(0.0, alive))
         received = client.receive(0.1)
         ended = {status.instance.process for status in received if status.state.ended}
     assert ended == {"two"}
     status = host.ended(client, "one")
-    assert time.monotonic() - alive >= 4.0
+    assert clocks.boot_time() - alive >= 4.0
     assert "no activity of its slave" in status.message
 
 
@@ -119,9 +119,9 @@ def test_a_fenced_tree_ends_within_its_grace(host, client):
 def test_a_killed_supervisor_puts_no_fence_off(host, client):
     """Repeated kills of the supervisor do not postpone the fence."""
     pid = host.sleeper(client, "one", fence=Fence(2.0, 0.0))
-    deadline = time.monotonic() + PATIENCE
+    deadline = clocks.boot_time() + PATIENCE
     while alive(pid):
-        assert time.monotonic() < deadline, f"not fenced within {PATIENCE} s"
+        assert clocks.boot_time() < deadline, f"not fenced within {PATIENCE} s"
         client = host.replace_supervisor(client)
         client.receive(0.3)
     host.ended_after_connect(client, "one")
@@ -129,13 +129,13 @@ def test_a_killed_supervisor_puts_no_fence_off(host, client):
 
 def test_the_next_supervisor_knows_the_last_contact(host, client):
     """The next supervisor counts from the last renewal, not from the start of the instance."""
-    heard = time.monotonic()
+    heard = clocks.boot_time()
     pid = host.sleeper(client, "one", fence=Fence(15.0, 0.0), last_contact=heard - 14.0)
-    client.send(ContactReported(time.monotonic(), 0.0))
+    client.send(ContactReported(clocks.boot_time(), 0.0))
     client.send(Remember(key_of(ONE), "after the word that counts"))
     client.start([host.order("other", "true")])
     host.ended(client, "other")  # by then the supervisor has read all orders
-    wait_until(lambda: time.monotonic() > heard + 1.5, "its start lies back so far")
+    wait_until(lambda: clocks.boot_time() > heard + 1.5, "its start lies back so far")
     client = host.replace_supervisor(client)
     assert client.fenced == {ONE}
     assert (of_one(client).state, of_one(client).pid) == (InstanceState.RUNNING, pid)
@@ -208,7 +208,7 @@ def test_a_resumed_supervisor_reads_renewals_before_it_fences(host, client):
     pid = host.sleeper(client, "one", fence=Fence(1.0, 0.0, alive=True))
 
     def renews() -> bool:
-        client.send(ContactReported(0.0, time.monotonic()))
+        client.send(ContactReported(0.0, clocks.boot_time()))
         return True
 
     os.kill(client.pid, signal.SIGSTOP)

@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 
+from rosrm import clocks
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import qos
 from rosrm.ros.fast_dds import Pace
@@ -68,13 +68,13 @@ def lose(pace: Pace) -> float:
     """Return the seconds from a lost request to its answer."""
     with server(), joined(pace) as participant:
         client = participant.node.create_client(srv.List, SERVICE, qos_profile=qos.SERVICE)
-        wait_for_service(participant, client, time.monotonic() + LIMIT)
+        wait_for_service(participant, client, clocks.boot_time() + LIMIT)
 
         def ask() -> float:
-            begun = time.monotonic()
+            begun = clocks.boot_time()
             answer = client.call_async(srv.List.Request())
             wait_until(participant, answer.done, begun + LIMIT)
-            return time.monotonic() - begun
+            return clocks.boot_time() - begun
 
         def ask_and_lose() -> float:
             subprocess.run(["nft", "-f", "-"], input=RULES, text=True, check=True)

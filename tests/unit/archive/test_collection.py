@@ -209,7 +209,7 @@ def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig, monkeypa
     rig.master.silent.add(HOST)
     rig.collect(3)
     assert len(rig.master.asked) == 1  # each request to it would wait for 10 s
-    monkeypatch.setattr("time.monotonic", lambda: 1e9)
+    monkeypatch.setattr("rosrm.clocks.boot_time", lambda: 1e9)
     assert rig.said == ["the slave of alpha does not answer"]
     rig.master.silent.clear()
     rig.collect()
@@ -281,7 +281,7 @@ def test_a_file_that_somebody_removes_is_collected_again(rig):
 def test_a_quiet_log_is_asked_for_less_and_less_often(rig, monkeypatch):
     """An event about the process ends the wait."""
     now = [0.0]
-    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    monkeypatch.setattr("rosrm.clocks.boot_time", lambda: now[0])
     rig.collector._every = 2.0
     rig.alpha.write(b"one\n")
     rig.collect()

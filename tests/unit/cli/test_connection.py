@@ -7,13 +7,13 @@ import os
 import re
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from typer.main import get_command
 
+from rosrm import clocks
 from rosrm.cli import connection, early
 from rosrm.cli.command_tree import app
 from rosrm.errors import NoMaster, RosrmError
@@ -57,7 +57,7 @@ def test_a_command_looks_for_a_master_until_3_s_after_its_start(monkeypatch, ela
 
     module = SimpleNamespace(MasterClient=MasterClient)
     monkeypatch.setitem(sys.modules, "rosrm.ros.master_connection", module)
-    monkeypatch.setattr(connection, "BEGUN", time.monotonic() - elapsed)
+    monkeypatch.setattr(connection, "BEGUN", clocks.boot_time() - elapsed)
     connection.connect(RosSettings())
     assert least <= seen["timeout"] <= most
     assert str(os.getpid()) in seen["name"]
@@ -164,7 +164,7 @@ def test_without_a_master_the_discovery_server_is_asked_after(monkeypatch, serve
     monkeypatch.setattr(master_connection, "user_security", lambda *_: NoSecurity())
     with pytest.raises(NoMaster) as refusal:
         master_connection.MasterClient.connect(
-            settings, name="x", timeout=1.6, joined=participant, begun=time.monotonic() - 3.0
+            settings, name="x", timeout=1.6, joined=participant, begun=clocks.boot_time() - 3.0
         )
     assert re.search(r"no master answered within 3\.\d s", str(refusal.value))
     assert ("Is the discovery server at desk:11811 running" in str(refusal.value)) == bool(server)

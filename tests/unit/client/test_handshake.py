@@ -19,7 +19,7 @@ class Network:
         self.now = 0.0
         self.sent: list[float] = []
 
-    def monotonic(self) -> float:
+    def boot_time(self) -> float:
         return self.now
 
     def spin(self, timeout: float) -> None:
@@ -41,7 +41,7 @@ class Network:
 def test_a_newly_discovered_server_gets_the_handshake_at_once(monkeypatch) -> None:
     """The service of a killed master looks ready, and the interval of repetitions is 0.5 s."""
     network = Network()
-    monkeypatch.setattr(master_connection, "time", network)
+    monkeypatch.setattr(master_connection, "clocks", network)
     found = _ask_until_answered(
         network, network, object(), 10.0, 0.5, servers=network.servers, look=_LOOK
     )

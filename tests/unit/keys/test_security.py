@@ -5,11 +5,11 @@ from __future__ import annotations
 import gc
 import os
 import pickle
-import time
 from types import SimpleNamespace
 
 import pytest
 
+from rosrm import clocks
 from rosrm.keys import security
 from rosrm.keys.cluster import ClusterSecret, own_grant
 from rosrm.keys.links import SealedMessage
@@ -195,7 +195,7 @@ def test_another_submission_of_a_process_has_another_key_of_its_snapshots(
 def introduced(master: MasterSecurity, until: float = 59.0) -> tuple[Peer, Ticket, MemberSecurity]:
     """Return robot-1 as ada sees it, ada's ticket, and robot-1's own security."""
     robot = member(ROBOT)
-    expiry = time.monotonic_ns() + int(until * 1e9)
+    expiry = clocks.boot_time_ns() + int(until * 1e9)
     ticket = Ticket(expiry, 3, "read_log", 7, "talker", ADA.principal)
     key = master.introduction(master.peer("host:robot-1", 3), ticket)
     return member(ADA).bearer(ticket.text(), key, robot.run), ticket, robot
@@ -226,7 +226,7 @@ def test_two_links_of_one_ticket_use_no_nonce_twice(master: MasterSecurity) -> N
 def test_no_valid_ticket_is_forgotten(master: MasterSecurity, monkeypatch) -> None:
     """Otherwise its recorded requests would open again. Each bearer has a bound of its own."""
     now = 0
-    monkeypatch.setattr(security, "time", SimpleNamespace(monotonic_ns=lambda: now))
+    monkeypatch.setattr(security, "clocks", SimpleNamespace(boot_time_ns=lambda: now))
     monkeypatch.setattr(security, "_MOST_TICKETS", 2)
     robot = member(ROBOT)
 
@@ -273,7 +273,7 @@ def test_a_ticket_is_valid_for_a_minute(master: MasterSecurity, until: float) ->
 def test_tickets_do_not_expire_while_the_master_is_away(monkeypatch) -> None:
     """No client could get another ticket, and slaves would send no replicas."""
     now = 0
-    monkeypatch.setattr(security, "time", SimpleNamespace(monotonic_ns=lambda: now))
+    monkeypatch.setattr(security, "clocks", SimpleNamespace(boot_time_ns=lambda: now))
     robot = member(ROBOT)
     valid, expired = (
         Ticket(until, 3, "store_replica", 0, "talker", Principal("host", "robot-2"))

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import socket
 import threading
-import time
 from types import SimpleNamespace
 
 import pytest
 
+from rosrm import clocks
 from rosrm.keys.cluster import ClusterSecret, own_grant
 from rosrm.keys.roles import Principal
 from rosrm.keys.security import MasterSecurity, MemberSecurity, NoSecurity
@@ -50,7 +50,7 @@ class Side:
         """Return the answer to a genuine request."""
         with self.connect() as connection:
             request = master_socket.request_of(SERVICE, ENVELOPE)
-            return master_socket.ask(connection, request, time.monotonic() + seconds, None)
+            return master_socket.ask(connection, request, clocks.boot_time() + seconds, None)
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_a_malformed_envelope_reaches_its_service_as_such(side: Side) -> None:
     """The service counts it, as it does a malformed one over DDS, and does not answer."""
     with side.connect() as connection:
         request = SERVICE.encode() + b"\0" + b"no envelope"
-        assert master_socket.ask(connection, request, time.monotonic() + PATIENCE, None) is None
+        assert master_socket.ask(connection, request, clocks.boot_time() + PATIENCE, None) is None
     assert side.taken == [None]
 
 
@@ -124,7 +124,7 @@ def test_a_client_that_does_not_read_holds_up_no_other(side: Side) -> None:
     side.more = bytes(1 << 22)
     with side.connect() as slow:
         master_socket.send(
-            slow, master_socket.request_of(SERVICE, ENVELOPE), time.monotonic() + PATIENCE
+            slow, master_socket.request_of(SERVICE, ENVELOPE), clocks.boot_time() + PATIENCE
         )
         wait_until(lambda: side.taken, "the request of the slow client")
         side.more = b""
@@ -139,9 +139,9 @@ def test_a_request_without_an_answer_ends_at_its_time(side: Side, monkeypatch) -
     waits: list[float] = []
     with side.connect() as connection:
         request = master_socket.request_of(SERVICE, ENVELOPE)
-        until = time.monotonic() + 0.35
+        until = clocks.boot_time() + 0.35
         assert master_socket.ask(connection, request, until, waits.append) is None
-        assert time.monotonic() >= until
+        assert clocks.boot_time() >= until
     late.pop()(ENVELOPE)  # ends the wait of the thread
     assert waits
     assert waits == sorted(waits)

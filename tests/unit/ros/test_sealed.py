@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from array import array
 from types import SimpleNamespace
 
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 
+from rosrm import clocks
 from rosrm.errors import Refused
 from rosrm.keys.cluster import ClusterSecret, own_grant
 from rosrm.keys.links import SealedMessage
@@ -92,7 +92,7 @@ def test_a_request_for_another_run_is_left_to_that_run(refuses) -> None:
         srv.ReadLog, "/read_log", lambda *_: pytest.fail("it was handled"), MemberSecurity(key)
     )
     service.endpoints.refuses_other_runs = refuses
-    sender = MemberSecurity(key).bearer(*_ticket(key, time.monotonic_ns() + 10**10), bytes(RUN))
+    sender = MemberSecurity(key).bearer(*_ticket(key, clocks.boot_time_ns() + 10**10), bytes(RUN))
     codes = [response.answer.code for response in service.answers(sender=sender)]
     assert codes == (["stale"] if refuses else [])
 
@@ -178,7 +178,7 @@ def test_only_a_ticket_in_force_is_accepted(seconds, version, is_handled) -> Non
         srv.ReadLog, "/read_log", lambda *_: handled.append("ticket"), MemberSecurity(key)
     )
     service.security.note_beat(tickets_from=7)
-    until = time.monotonic_ns() + int(seconds * 1e9)
+    until = clocks.boot_time_ns() + int(seconds * 1e9)
     ticket = Ticket(until, version, "read_log", 0, "p", Principal("user", "ada"))
     bearer = MemberSecurity(key).bearer(ticket.text(), ticket.key(key.key), service.security.run)
     codes = [response.answer.code for response in service.answers(sender=bearer)]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import queue
-import time
 from dataclasses import replace
 
 import pytest
 
+from rosrm import clocks
 from rosrm.artifacts.cache import set_directory, without_directories
 from rosrm.artifacts.pack import Archive
 from rosrm.core.slave import reducer
@@ -91,10 +91,10 @@ class Host:
         self.ended[assignment.instance] = fault
 
     def run_until(self, condition, what: str, now: float | None = None) -> None:
-        deadline = time.monotonic() + PATIENCE
+        deadline = clocks.boot_time() + PATIENCE
         while not condition():
-            assert time.monotonic() < deadline, f"{what}; {self.reports}, {self.ended}"
-            self.service.tick(time.monotonic() if now is None else now)
+            assert clocks.boot_time() < deadline, f"{what}; {self.reports}, {self.ended}"
+            self.service.tick(clocks.boot_time() if now is None else now)
             try:
                 self.calls.get(timeout=0.02)()
             except queue.Empty:
@@ -203,8 +203,8 @@ def test_a_host_without_a_master_waits(host, offered, monkeypatch):
     monkeypatch.setattr(fetch, "PATIENCE", 0.2)
     host.has_master, host.master.is_silent = False, True
     instance = host.prepare(1, offered("model"))
-    later = time.monotonic() + 0.6
-    host.run_until(lambda: time.monotonic() >= later, "some time passes")
+    later = clocks.boot_time() + 0.6
+    host.run_until(lambda: clocks.boot_time() >= later, "some time passes")
     host.has_master, host.master.is_silent = True, False
     assert host.outcome(instance) == ""
 

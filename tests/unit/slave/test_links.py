@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import socket
-import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
 
 import pytest
 
+from rosrm import clocks
 from rosrm.config.settings import LinkSettings
 from rosrm.keys import link_packets
 from rosrm.model.links import INTERFACES, LinkPeer, LinkReport
@@ -42,7 +42,7 @@ def measured(
 
     def done() -> bool:
         each_turn()
-        one.turn(time.monotonic())
+        one.turn(clocks.boot_time())
         return bool(reports)
 
     wait_until(done, "a report on links", 20.0)
@@ -65,8 +65,8 @@ def test_a_round_trip_is_measured_without_the_wait_at_the_other_slave(both) -> N
     turns = [0.0]
 
     def seldom() -> None:
-        if time.monotonic() - turns[-1] > 0.2:
-            turns.append(time.monotonic())
+        if clocks.boot_time() - turns[-1] > 0.2:
+            turns.append(clocks.boot_time())
             other.turn(turns[-1])
 
     report = measured(one, MeasureLinks((peer(other),)), seldom)
@@ -87,7 +87,7 @@ def test_a_peer_with_another_key_gets_no_answer(both) -> None:
     """Neither side takes packets under a wrong key."""
     one, other = both
     order = MeasureLinks((peer(other, key=b"x" * 32),))
-    report = measured(one, order, lambda: other.turn(time.monotonic()))
+    report = measured(one, order, lambda: other.turn(clocks.boot_time()))
     assert math.isnan(report.peers[2][1])
 
 
@@ -95,7 +95,7 @@ def test_the_address_that_answers_is_found(both) -> None:
     """A host may have addresses that others cannot reach."""
     one, other = both
     order = MeasureLinks((peer(other, addresses=("127.0.0.77", "192.0.2.1", LOCAL)),))
-    report = measured(one, order, lambda: other.turn(time.monotonic()))
+    report = measured(one, order, lambda: other.turn(clocks.boot_time()))
     assert report.peers[2][1] < 1.0
 
 
@@ -123,7 +123,7 @@ def test_a_flood_takes_a_bounded_number_of_packets_each_turn(both, monkeypatch) 
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         for _ in range(500):
             stranger.sendto(b"x" * 48, target)
-    one.turn(time.monotonic())
+    one.turn(clocks.boot_time())
     assert 0 < len(checked) <= 16
 
 

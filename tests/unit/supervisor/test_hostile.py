@@ -7,13 +7,13 @@ import json
 import math
 import os
 import socket
-import time
 from types import SimpleNamespace
 
 import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 
+from rosrm import clocks
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.reducer import SupervisorState
@@ -163,10 +163,10 @@ def check_record(state):
     for instance in recorded.instances.values():
         core.restore(instance)
     for event in (events.TimePassed(), events.ContactReported(1.0), events.ShutdownOrdered()):
-        core.handle(event, time.monotonic())
+        core.handle(event, clocks.boot_time())
     for instance in core.instances.values():
         messages.encode_status(messages.Status.of(instance))
-        core.handle(events.FencePassed(instance.key), time.monotonic())
+        core.handle(events.FencePassed(instance.key), clocks.boot_time())
     record = instance_record.InstanceRecord(str(state))
     record.rewrite(core, recorded.launches, recorded.environments, lambda key: 0)
     assert record.trouble == ""
@@ -211,9 +211,9 @@ def test_a_process_that_cannot_exist_is_refused_alone(server, order):
     ours, peer = socket.socketpair()
     with peer:
         talk(one, ours, peer, order)
-        deadline = time.monotonic() + PATIENCE
+        deadline = clocks.boot_time() + PATIENCE
         while not (ended := [i for i in one._core.instances.values() if i.phase != "starting"]):
-            assert time.monotonic() < deadline
+            assert clocks.boot_time() < deadline
             one._round()
             one._take_in(0.1)
         assert ended[0].phase in ("refused", "backoff", "failed")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import signal
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rosrm import clocks
 from rosrm.cli.options import Domain
 from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError, RosrmError
@@ -72,7 +72,7 @@ def try_sink(
     chosen = {one.name: one for one in load_alerts(file, registry).sinks}
     if sink not in chosen:
         raise ConfigError(f"{file}: no sink {sink!r}; there are: {listed(chosen) or 'none'}")
-    now = time.time()
+    now = clocks.wall_time()
     notice = Notice(f"try-{now:.6f}", now, "try", "`rosrm alerts try` sent this notice")
     with closing(_made(chosen[sink], registry)) as made:
         made.send([notice])

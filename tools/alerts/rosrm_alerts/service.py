@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import Final
 
-from rosrm import Client, EventRow, EventSink, HostRow, Listing, NoMaster, Notice, ProcessRow
+from rosrm import (
+    Client,
+    EventRow,
+    EventSink,
+    HostRow,
+    Listing,
+    NoMaster,
+    Notice,
+    ProcessRow,
+    clocks,
+)
 from rosrm.model.notices import notice_of
 from rosrm_alerts.alerts_file import AlertsFile
 from rosrm_alerts.conditions import (
@@ -78,7 +87,7 @@ class AlertService:
             events = self._new(listing)
             self._position = listing.last_sequence
         situation = None if listing is None else situation_of(listing)
-        changes = self._watch.observe(time.time(), situation, map(_seen, events))
+        changes = self._watch.observe(clocks.wall_time(), situation, map(_seen, events))
         for change in changes:
             _log.info("alert %s %s: %s", change.alert.name, change.kind, change.message)
         notices = [

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
 
+from rosrm import clocks
 from rosrm.errors import LabError
 from rosrm.runtime import cgroups
 from rosrm_lab.plan import PREFIX, HostPlan
@@ -137,12 +138,12 @@ def kill(hierarchies: Sequence[Hierarchy], lab: str, host: str = "") -> None:
     Raises:
         LabError: some did not end.
     """
-    deadline = time.monotonic() + _GONE
+    deadline = clocks.boot_time() + _GONE
     while pids := members(hierarchies, lab, host):
         for pid in pids:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        if time.monotonic() > deadline:
+        if clocks.boot_time() > deadline:
             raise LabError(
                 f"processes of lab {lab!r} do not end, {_GONE:g} s after SIGKILL: "
                 f"{', '.join(map(str, sorted(pids)))}. Look at them (`ps`), then repeat this"
@@ -156,7 +157,7 @@ def remove(hierarchies: Sequence[Hierarchy], lab: str) -> None:
     Raises:
         LabError: a process did not end, or a group could not be removed.
     """
-    deadline = time.monotonic() + _GONE
+    deadline = clocks.boot_time() + _GONE
     while True:
         kill(hierarchies, lab)
         left = [failure for h in hierarchies if (failure := _remove_tree(h.top / lab))]
@@ -164,7 +165,7 @@ def remove(hierarchies: Sequence[Hierarchy], lab: str) -> None:
             break
         # The kernel releases a group a moment after its last process has gone; and a process that
         # was about to enter may have done so.
-        if time.monotonic() > deadline:
+        if clocks.boot_time() > deadline:
             raise LabError(f"control groups cannot be removed: {'; '.join(left)}")
         time.sleep(_LOOK)
     for hierarchy in hierarchies:

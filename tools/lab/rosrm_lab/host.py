@@ -9,12 +9,12 @@ import select
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import ConfigError, LabError
 from rosrm.runtime.ros_wheels import without_bootstrapper
 from rosrm_lab import groups, store
@@ -89,7 +89,7 @@ def boot(hierarchies: Sequence[Hierarchy], lab: str, host: HostPlan, hosts_file:
             )
         finally:
             os.close(writer)
-        lines = _until_ready(ready.fileno(), time.monotonic() + _BOOT)
+        lines = _until_ready(ready.fileno(), clocks.boot_time() + _BOOT)
         output = _last_words(launcher)
     pid = next((int(line[4:]) for line in lines if line.startswith("pid ")), 0)
     birth = Birth.of(pid) if pid and lines[-1] == "ready" else None
@@ -243,7 +243,7 @@ def _until_ready(reader: int, deadline: float) -> list[str]:
     """Return the lines of the first process, until it is ready, has failed or takes too long."""
     said = b""
     while not (said.endswith(b"\n") and said.split(b"\n")[-2].startswith((b"ready", b"failed"))):
-        if not _readable(reader, max(0.0, deadline - time.monotonic())):
+        if not _readable(reader, max(0.0, deadline - clocks.boot_time())):
             break
         part = os.read(reader, 4096)
         if not part:

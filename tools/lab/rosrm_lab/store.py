@@ -17,6 +17,7 @@ from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import LabError
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor.procfs import read_stat
@@ -180,13 +181,13 @@ def lock(name: str, timeout: float = 30.0) -> Iterator[None]:
         timeout: seconds to wait for another command.
     """
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as claim:
-        deadline = time.monotonic() + timeout
+        deadline = clocks.boot_time() + timeout
         while True:
             try:
                 claim.bind(f"\0{PREFIX}:{name}")
                 break
             except OSError:
-                if time.monotonic() > deadline:
+                if clocks.boot_time() > deadline:
                     raise LabError(
                         f"another command is at work on lab {name!r}, for more than {timeout:g} s: "
                         "wait for its end, or end it"

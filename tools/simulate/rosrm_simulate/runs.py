@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from math import inf
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.config.documents import Node
 from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import ClusterConfig
@@ -243,9 +243,9 @@ def run(
         workload = workload.with_hosts(variant.hosts)
     placement, strategies, declared = _plugins(variant.cluster, registry)
     simulation = Simulation(workload, variant.cluster.core(), placement, strategies, declared)
-    began = time.perf_counter()
+    began = clocks.awake_time()
     outcome = simulation.run(None if shown is None else shown.named(variant.name))
-    return SimulationRun(variant.name, len(workload.hosts), outcome, time.perf_counter() - began)
+    return SimulationRun(variant.name, len(workload.hosts), outcome, clocks.awake_time() - began)
 
 
 def _plugins(
@@ -263,7 +263,7 @@ class Shown:
 
         self._console = Console(stderr=True)
         self._status = self._console.status("")
-        self._began = time.monotonic()
+        self._began = clocks.boot_time()
         self._on = False
         self._name = ""
 
@@ -274,7 +274,7 @@ class Shown:
 
     def __call__(self, progress: Progress) -> None:
         """Show the progress of a run."""
-        if not sys.stderr.isatty() or time.monotonic() - self._began < _SHOWN_AFTER:
+        if not sys.stderr.isatty() or clocks.boot_time() - self._began < _SHOWN_AFTER:
             return
         self._status.update(
             f"{self._name}: {progress.now:.0f} s simulated, {progress.ended} of "

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
+from rosrm import clocks
 from rosrm_web.watching import give_up_early
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ class _Recent:
         if not self.task.done():
             return True
         is_failed = self.task.cancelled() or self.task.exception() is not None
-        return not is_failed and time.monotonic() - self.begun < FRESH
+        return not is_failed and clocks.boot_time() - self.begun < FRESH
 
 
 def _list(client: Client, parts: dict[str, Any]) -> Listing:
@@ -51,7 +51,7 @@ class Listings:
         recent = self._recent.get(key)
         if recent is None or not recent.is_usable:
             request = self._link.ask(partial(_list, parts=parts))
-            recent = _Recent(asyncio.create_task(request), time.monotonic())
+            recent = _Recent(asyncio.create_task(request), clocks.boot_time())
             self._recent[key] = recent
         return await asyncio.shield(recent.task)  # a reader that leaves stops no other reader
 

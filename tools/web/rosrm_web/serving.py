@@ -9,7 +9,6 @@ import math
 import resource
 import signal
 import socket
-import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 
 import uvicorn
 
+from rosrm import clocks
 from rosrm.errors import ConfigError, NoMaster, Refused
 from rosrm_web.access import Access
 from rosrm_web.app import create_app
@@ -120,7 +120,7 @@ class AcceptErrors:
         clock: monotonic seconds.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, clock: Callable[[], float] = clocks.boot_time) -> None:
         self._clock = clock
         self._logged, self._more = -math.inf, 0
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import secrets
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
+
+from rosrm import clocks
 
 if TYPE_CHECKING:
     from rosrm_web.access import Access
@@ -28,7 +29,7 @@ class Sessions:
         clock: monotonic seconds.
     """
 
-    def __init__(self, access: Access, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, access: Access, clock: Callable[[], float] = clocks.boot_time) -> None:
         self._access = access
         self._clock = clock
         #: Digest of each id to its user and end; the ids are not kept.

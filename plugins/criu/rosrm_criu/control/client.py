@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import PortableError
 from rosrm.supervisor.procfs import read_environment
 from rosrm_criu.control.directory import make
@@ -265,14 +266,14 @@ def _await(
     directory: Path, request_id: str, target: State, timeout: float, pid: int | None
 ) -> Status:
     """Return the first status that answers a request or is final."""
-    deadline = time.monotonic() + timeout
+    deadline = clocks.boot_time() + timeout
     while True:
         status = read_message(directory, Status)
         if status is not None and _is_answer(status, request_id, target):
             return status
         if pid is not None:
             _of_process(pid)
-        if time.monotonic() >= deadline:
+        if clocks.boot_time() >= deadline:
             raise PortableError(_why_not(directory, request_id, target, timeout, pid, status))
         time.sleep(_LOOK)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-import time
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import PortableError
 from rosrm_criu.control.client import make_directory
 from rosrm_criu.control.directory import remove_directory
@@ -53,7 +53,7 @@ class Listener:
 
     def next_request(self) -> Request | None:
         """Return the request that the node has to act on now; None: there is no new one."""
-        if time.monotonic() > self._reported + _FRESH:
+        if clocks.boot_time() > self._reported + _FRESH:
             self.report(self.status)
         request = self._read()
         if request is None or request == self._seen:
@@ -75,7 +75,7 @@ class Listener:
         if self.status.request not in ("", status.request):
             self._ended.append(self.status.request)
         self.status = status
-        self._reported = time.monotonic()
+        self._reported = clocks.boot_time()
         try:
             write_message(self._directory, status)
         except OSError as error:

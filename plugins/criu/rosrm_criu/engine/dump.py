@@ -19,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final, Literal
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths, procfs
 from rosrm.supervisor.procfs import inner_pid
@@ -89,8 +90,8 @@ def dump(  # noqa: PLR0913 - two of them name the process
         image.check_room(directory, process_tree.memory_of(pids))
         copied = _run(criu, root, directory, timeout, process, receive)
         manifest = _describe(root, directory, Manifest(
-            process, instance, platform.node(), time.time(), criu.version, platform.release(),
-            platform.machine(), inner_pid(root), (), (), "", _shelter(pid), "",
+            process, instance, platform.node(), clocks.wall_time(), criu.version,
+            platform.release(), platform.machine(), inner_pid(root), (), (), "", _shelter(pid), "",
         ))  # fmt: skip
         manifest = replace(manifest, sizes={**manifest.sizes, **copied})
         if leave == "running" and not was_stopped:
@@ -142,10 +143,10 @@ def _run(
     )  # fmt: skip
     inside = replace(criu, command=(*process_tree.entering(root), *criu.command))
 
-    end = time.monotonic() + timeout
+    end = clocks.boot_time() + timeout
 
     def run(*more: str, pass_fds: Sequence[int] = ()) -> None:
-        left = end - time.monotonic()
+        left = end - clocks.boot_time()
         if left < timeout / 2:  # CRIU would be killed before its end, which can harm the process
             raise CriuError(
                 f"the pages of {process or f'pid {root}'} could not be received, and less than "
@@ -222,9 +223,9 @@ def _go_on(root: int, was_stopped: bool) -> str:
         process_tree.send([pid for pid in pids if process_tree.is_stopped(pid)], signal.SIGCONT)
     if not process_tree.is_alive(root):
         return f". The process (pid {root}) ended during the dump"
-    end = time.monotonic() + _SIGNAL
+    end = clocks.boot_time() + _SIGNAL
     while not was_stopped and any(map(process_tree.is_stopped, pids)):
-        if time.monotonic() > end:
+        if clocks.boot_time() > end:
             return f". The process (pid {root}) is still stopped"
         time.sleep(0.001)
     return ""

@@ -17,13 +17,13 @@ import socket
 import subprocess
 import sys
 import tempfile
-import time
 import uuid
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm_criu.engine.binary import OLDEST, REMEDY, CriuBinary, find
 from rosrm_criu.engine.compatibility import INTERPRETER, facts_of
@@ -98,7 +98,7 @@ def probe(criu: CriuBinary, *, timeout: float = TIMEOUT) -> CriuSupport:
     """
     reason = ""
     try:
-        _exercise(criu, time.monotonic() + timeout)
+        _exercise(criu, clocks.boot_time() + timeout)
     except CriuError as error:
         reason = _with_remedy(criu, str(error))
     except (OSError, subprocess.TimeoutExpired) as error:
@@ -165,7 +165,7 @@ class _Trial:
     @property
     def left(self) -> float:
         """Return the seconds that are left."""
-        return self.until - time.monotonic()
+        return self.until - clocks.boot_time()
 
     def run(self, *arguments: str) -> None:
         """Run a CRIU command; raise `CriuError`."""

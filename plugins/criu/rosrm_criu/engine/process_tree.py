@@ -10,6 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.supervisor.procfs import everyone, inner_pid, read_stat
 
 #: Namespaces that CRIU must share with the process that it dumps, each with its nsenter option.
@@ -146,10 +147,10 @@ def memory_of(pids: Iterable[int]) -> int:
 
 def wait_until_stopped(pids: Iterable[int], timeout: float) -> bool:
     """Wait until each process is stopped or gone; return False after the timeout in seconds."""
-    end = time.monotonic() + timeout
+    end = clocks.boot_time() + timeout
     waiting = list(pids)
     while waiting := [pid for pid in waiting if is_alive(pid) and not is_stopped(pid)]:
-        if time.monotonic() > end:
+        if clocks.boot_time() > end:
             return False
         time.sleep(0.001)  # polled, because no event reports a stop
     return True

@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm_criu.engine import paths
 
@@ -109,7 +110,7 @@ def wait(directory: Path, *, timeout: float, ended: Callable[[], bool] = lambda:
     Raises:
         CriuError: the restore failed, or there is no result in time.
     """
-    end = time.monotonic() + timeout
+    end = clocks.boot_time() + timeout
     while True:
         is_over = ended()  # first, because a result written before the end is then found
         outcome = read(directory)
@@ -117,7 +118,7 @@ def wait(directory: Path, *, timeout: float, ended: Callable[[], bool] = lambda:
             break
         if is_over:
             raise CriuError(f"the restore of {directory} ended without a result")
-        if time.monotonic() > end:
+        if clocks.boot_time() > end:
             raise CriuError(f"the restore of {directory} has not reported for {timeout:g} s")
         time.sleep(_LOOK)
     if outcome.reason:

@@ -25,10 +25,11 @@ import resource
 import select
 import signal
 import sys
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
+
+from rosrm import clocks
 
 if not __package__:
     sys.path += [str(Path(__file__).resolve().parents[2]), sys.argv.pop(1)]
@@ -65,7 +66,7 @@ _libc = ctypes.CDLL(None, use_errno=True)
 
 def main() -> None:
     """Restore the process, and end as it ends."""
-    began = time.monotonic()
+    began = clocks.boot_time()
     words, then = _split(sys.argv[1:])
     options = _options(words)
     directory = Path(options.directory).absolute()
@@ -142,7 +143,7 @@ class _Restore:
 
     def report(self, pid: int, *, namespace: bool) -> None:
         """Report success: first write the result, for all later readers; then remove the image."""
-        seconds = round(time.monotonic() - self.began, 3)
+        seconds = round(clocks.boot_time() - self.began, 3)
         inner_pid = self.manifest.pid
         outcome = Outcome(pid=pid, inner_pid=inner_pid, namespace=namespace, seconds=seconds)
         try:

@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm_criu.engine import (
     dump,
@@ -62,7 +63,7 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
     trouble = external_resources.shared_memory(pids)
     if trouble:
         raise CriuError(f"{asked.process} cannot be checkpointed: {trouble}")
-    directory, began = checkpoint(asked.state, asked.source), time.monotonic()
+    directory, began = checkpoint(asked.state, asked.source), clocks.boot_time()
     artifacts.discard(directory)
     attempts.check_wanted(asked.attempt)
     try:
@@ -76,7 +77,7 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
         dump.resume(pid)
         _discard(asked.state, asked.source)
         raise
-    return {"size": manifest.size, "seconds": {"dump": time.monotonic() - began}}
+    return {"size": manifest.size, "seconds": {"dump": clocks.boot_time() - began}}
 
 
 def run_on(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -98,9 +99,9 @@ def kill(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     if pid:
         members = process_tree.tree(process_tree.root_of(pid))
         dump.kill(pid)
-        deadline = time.monotonic() + asked.timeout
+        deadline = clocks.boot_time() + asked.timeout
         while not all(map(process_tree.is_gone, members)):
-            if time.monotonic() > deadline:
+            if clocks.boot_time() > deadline:
                 raise CriuError(f"{asked.process}#{asked.source} does not end")
             time.sleep(_LOOK)
     _reserve(asked.state, asked.source)

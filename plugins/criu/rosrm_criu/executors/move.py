@@ -7,11 +7,11 @@ whose slave was restarted. `artifacts` has the state that is kept between the ca
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from rosrm import clocks
 from rosrm.errors import CriuError, PortableError
 from rosrm_criu.control.client import (
     ask_resume,
@@ -92,11 +92,11 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
     control = control_of(pid)
     try:
         sender = artifacts.open_sender(asked.source)
-        began = time.monotonic()
+        began = clocks.boot_time()
         left = leave(pid, control, asked.attempt, float(asked.arguments["seconds"]["leave"]))
-        dumped = time.monotonic()
+        dumped = clocks.boot_time()
         directory, dump_part = _dump(pid, asked)
-        offered = time.monotonic()
+        offered = clocks.boot_time()
         offer = _offer(sender, directory, asked)
     except Exception:  # any error: the node rejoins
         try:
@@ -108,7 +108,7 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
         "seconds": {
             "prepare": dumped - began, "leave": left, dump_part: offered - dumped,
-            "offer": time.monotonic() - offered,
+            "offer": clocks.boot_time() - offered,
         },
     }  # fmt: skip
 
@@ -255,7 +255,7 @@ def join(arguments: Answer) -> Answer:
     """Make the node rejoin the ROS graph here; kill one that never can, for its restart policy."""
     asked = StepArguments.of(arguments)
     pid = asked.pid(asked.destination)
-    root, began = process_tree.root_of(pid), time.monotonic()
+    root, began = process_tree.root_of(pid), clocks.boot_time()
     try:
         control = control_of(pid)
         ask_resume(control, root, asked.attempt)
@@ -272,4 +272,4 @@ def join(arguments: Answer) -> Answer:
 
 def _of_joining(status: Status, began: float) -> dict[str, float]:
     own = {f"node_{name}": value for name, value in status.seconds.items()}
-    return {"join": time.monotonic() - began, **own}
+    return {"join": clocks.boot_time() - began, **own}

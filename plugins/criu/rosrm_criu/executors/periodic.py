@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import CriuError, PortableError
 from rosrm_criu.control.client import await_joined
 from rosrm_criu.engine import dump as dumping
@@ -56,13 +57,13 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
     for directory in (parent.parent, parent):
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
     slots.discard_unfinished(parent)
-    slot, began = slots.new_slot(parent), time.monotonic()
+    slot, began = slots.new_slot(parent), clocks.boot_time()
     (parent / _AWAY).write_text(asked.attempt, encoding="utf-8")
     try:
         manifest, left = _dump_away(asked, pid, control, slot)
-        dumped = time.monotonic()
+        dumped = clocks.boot_time()
         status = await_joined(control, asked.attempt, _seconds(asked, "join"), root)
-        joined = time.monotonic()
+        joined = clocks.boot_time()
         _add_checksums(slot, manifest)
     except BaseException:  # any error: the image is useless
         shutil.rmtree(slot, ignore_errors=True)
@@ -82,7 +83,7 @@ def _dump_away(asked: StepArguments, pid: int, control: Path, slot: Path) -> tup
     """Dump the node; return the manifest and the time of departure. The node always rejoins."""
     try:
         leave(pid, control, asked.attempt, _seconds(asked, "leave"))
-        left = time.monotonic()
+        left = clocks.boot_time()
         with without_log_names():
             manifest = dumping.dump(
                 find(), pid, slot, leave="running", timeout=_seconds(asked, "dump"),
@@ -143,9 +144,9 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
 
 def _await_end_of_dump(instance: str, pid: int) -> None:
     """Wait for a CRIU that outlived its slave, because it stops the process when it finishes."""
-    deadline = time.monotonic() + _PATIENCE
+    deadline = clocks.boot_time() + _PATIENCE
     while tracer := external_resources.tracer(process_tree.root_of(pid)):
-        if time.monotonic() > deadline:
+        if clocks.boot_time() > deadline:
             raise CriuError(
                 f"{instance} is still being dumped after {_PATIENCE:g} s, by process {tracer}"
             )

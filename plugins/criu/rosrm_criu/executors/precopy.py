@@ -9,13 +9,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import threading
-import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm_criu.engine import copied_pages, dump, image, memory_copy, page_server, process_tree
 from rosrm_criu.engine.memory_copy import CHANGES, MemoryCopy, file_name
@@ -211,11 +211,11 @@ def _check_until(attempt: str, seconds: float) -> Callable[[], None]:
         attempt: id of the migration attempt; if it was given up, the check raises CriuError.
         seconds: after which the check raises ValueError.
     """
-    deadline = time.monotonic() + seconds
+    deadline = clocks.boot_time() + seconds
 
     def check() -> None:
         attempts.check_wanted(attempt)
-        if time.monotonic() > deadline:
+        if clocks.boot_time() > deadline:
             raise ValueError(f"the copy is given up: it has taken longer than {seconds:g} s")
 
     return check

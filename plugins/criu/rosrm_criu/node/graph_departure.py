@@ -12,6 +12,7 @@ from typing import Any, Final
 from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 
+from rosrm import clocks
 from rosrm.node.entities import TimerOf
 
 #: Topics of every node, which no node's work depends on.
@@ -121,9 +122,9 @@ def await_readers(node: Any, patience: float) -> None:
         node: the node, which is about to leave.
         patience: seconds for all of them together, so that a stopped reader delays nothing more.
     """
-    deadline = time.monotonic() + patience
+    deadline = clocks.boot_time() + patience
     for one in node.publishers:
-        left = max(0.0, deadline - time.monotonic())
+        left = max(0.0, deadline - clocks.boot_time())
         one.wait_for_all_acked(Duration(seconds=left))
 
 
@@ -162,9 +163,9 @@ def sees_again(node: Any, others: Mapping[tuple[str, str], int], patience: float
         others: result of `others_of` before the departure.
         patience: most seconds to wait.
     """
-    deadline = time.monotonic() + patience
+    deadline = clocks.boot_time() + patience
     while any(_count(node, end) < count for end, count in others.items()):
-        if time.monotonic() >= deadline or not node.context.ok():
+        if clocks.boot_time() >= deadline or not node.context.ok():
             return False
         time.sleep(_LOOK)
     return True
@@ -201,7 +202,7 @@ def await_peers(node: Any, before: Mapping[str, int], patience: float) -> tuple[
     Returns:
         A description of each missing peer; empty if all are matched.
     """
-    deadline = time.monotonic() + patience
+    deadline = clocks.boot_time() + patience
     while node.context.ok():
         now = peers_of(node)
         missing = tuple(
@@ -209,7 +210,7 @@ def await_peers(node: Any, before: Mapping[str, int], patience: float) -> tuple[
             for key, count in before.items()
             if now.get(key, count) < count
         )
-        if not missing or time.monotonic() >= deadline:
+        if not missing or clocks.boot_time() >= deadline:
             return missing
         time.sleep(_LOOK)
     return ()

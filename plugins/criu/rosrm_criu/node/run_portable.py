@@ -18,6 +18,7 @@ from rclpy._rclpy_pybind11 import RCLError
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import uninstall_signal_handlers
 
+from rosrm import clocks
 from rosrm.errors import PortableError
 from rosrm.ros import fast_dds_relocation
 from rosrm.ros.graph_remains import what_is_left
@@ -173,7 +174,7 @@ class _Run:
         return None
 
     def _asked(self) -> Request | None:
-        now = time.monotonic()
+        now = clocks.boot_time()
         if self._listener is None or not (self._woken or now >= self._looked + _LOOK):
             return None
         self._looked, self._woken = now, False
@@ -186,7 +187,7 @@ class _Run:
 
         If that is known in advance, the node does not leave, and no state is returned.
         """
-        began = time.monotonic()
+        began = clocks.boot_time()
         listener = self._its_listener()
         listener.report(Status(State.LEAVING, request.id))
         try:
@@ -198,7 +199,7 @@ class _Run:
         departure, fault = self._depart()
         fault = fault or _not_clean()
         if not fault:
-            seconds = {"leave": round(time.monotonic() - began, 6)}
+            seconds = {"leave": round(clocks.boot_time() - began, 6)}
             listener.report(Status(State.LEFT, request.id, seconds=seconds))
         return departure, fault
 
@@ -208,15 +209,15 @@ class _Run:
         Readers acknowledge only after the next heartbeat of their writer (0.1 s). If the node
         waited for that in its departure, it would be silent for that time.
         """
-        deadline = time.monotonic() + _ACKNOWLEDGED
-        while not have_acknowledged(self._node) and time.monotonic() < deadline:
+        deadline = clocks.boot_time() + _ACKNOWLEDGED
+        while not have_acknowledged(self._node) and clocks.boot_time() < deadline:
             self._executor.spin_once(timeout_sec=0.002)
 
     def _come_to_rest(self) -> None:
         """Wait for the end of pending callbacks, so that the departure interrupts none."""
-        deadline = time.monotonic() + _REST
+        deadline = clocks.boot_time() + _REST
         while unfinished := _unfinished(self._executor):
-            if time.monotonic() > deadline:
+            if clocks.boot_time() > deadline:
                 raise PortableError(
                     f"{len(unfinished)} callbacks have begun and not ended in {_REST:g} s (async "
                     f"functions that wait, or goals that are executed); the node stays as it was"
@@ -279,17 +280,17 @@ class _Run:
 
     def _arrive(self, request: Request, departure: Departure) -> tuple[str, ...]:
         listener = self._its_listener()
-        began = time.monotonic()
+        began = clocks.boot_time()
         listener.enter(State.JOINING, request.id)
         guids_are_new = fast_dds_relocation.look_again()
         entries = self._enter(departure)
-        seen = time.monotonic()
+        seen = clocks.boot_time()
         node = self._node
         node._portable_join_again(departure)  # noqa: SLF001 - the other half of one thing
         self._add_executor()
-        left = max(0.0, began + self._patience - time.monotonic())
+        left = max(0.0, began + self._patience - clocks.boot_time())
         missing: tuple[str, ...] = node._portable_go_on(departure, left)  # noqa: SLF001
-        found = time.monotonic()
+        found = clocks.boot_time()
         times = {
             "enter": round(seen - began, 6), "entries": entries, "join": round(found - seen, 6),
         }  # fmt: skip
@@ -312,13 +313,13 @@ class _Run:
         is lost as well, the node enters as another participant (docs/decisions/0024).
         """
         entries = 0
-        deadline = time.monotonic() + self._patience
+        deadline = clocks.boot_time() + self._patience
         while True:
             entries += 1
             self._give_signals_back()
             rclpy.init(args=without_parameter_files(self._args))
             self._node._portable_enter_again(departure)  # noqa: SLF001 - the other half of one thing
-            last = entries == _ENTRIES or deadline - time.monotonic() <= _GREETED
+            last = entries == _ENTRIES or deadline - clocks.boot_time() <= _GREETED
             if last or sees_again(self._node, departure.others, _GREETED):
                 self._is_in = True
                 return entries

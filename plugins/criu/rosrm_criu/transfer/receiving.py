@@ -7,11 +7,11 @@ import hashlib
 import hmac
 import socket
 import ssl
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.errors import TransferError
 from rosrm.runtime.disk_space import room_for
 from rosrm_criu.transfer.addresses import nearest_first
@@ -55,7 +55,7 @@ class _Stream:
     def __init__(self, offer: Offer, *, timeout: float, identity: TlsIdentity) -> None:
         self._offer = offer
         self._timeout = timeout
-        self._deadline = time.monotonic() + timeout
+        self._deadline = clocks.boot_time() + timeout
         self._part = 0  # bytes that are left of the current part
         self.received = 0
         self._connection, self.address = self._connect(_context(identity))
@@ -130,13 +130,13 @@ class _Stream:
 
     def _receive(self, size: int) -> bytes:
         """Return at most `size` bytes, and at least one; raise `TransferError`."""
-        if time.monotonic() > self._deadline:
+        if clocks.boot_time() > self._deadline:
             raise TransferError(f"the transfer took longer than {self._timeout:g} s")
         try:
             self._connection.settimeout(self._seconds(_SILENCE))
             data = self._connection.recv(size)
         except TimeoutError:
-            if time.monotonic() > self._deadline:
+            if clocks.boot_time() > self._deadline:
                 return self._receive(size)
             raise TransferError(f"the transfer was cut: nothing came for {_SILENCE:g} s") from None
         except OSError as error:
@@ -146,7 +146,7 @@ class _Stream:
         return data
 
     def _seconds(self, most: float) -> float:
-        return max(0.1, min(most, self._deadline - time.monotonic()))
+        return max(0.1, min(most, self._deadline - clocks.boot_time()))
 
 
 class _AnotherServer(Exception):
@@ -170,7 +170,7 @@ def receive(
     Raises:
         TransferError: the directory cannot be fetched completely; nothing of it is left.
     """
-    began = time.monotonic()
+    began = clocks.boot_time()
     if identity.fingerprint != offer.to:
         raise TransferError("what is offered is for another destination than this one")
     with contextlib.closing(StagingDirectory(target)) as landing:
@@ -185,7 +185,7 @@ def receive(
         size=offer.size,
         files=offer.files,
         received=stream.received,
-        seconds=time.monotonic() - began,
+        seconds=clocks.boot_time() - began,
         checksum=checksum,
     )
 

@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final, Literal
 
+from rosrm import clocks
 from rosrm.errors import TransferError
 from rosrm_criu.transfer.addresses import own_addresses
 from rosrm_criu.transfer.archive import Archive
@@ -168,7 +169,7 @@ class _Server:
             for piece in self._archive.compressed():
                 connection.sendall(len(piece).to_bytes(PART_HEAD, "big") + piece)
                 self.sent += len(piece)
-                time.sleep(self._pace.wait(len(piece), time.monotonic()))
+                time.sleep(self._pace.wait(len(piece), clocks.boot_time()))
         except TransferError as error:
             _say_fault(connection, str(error))
             return False

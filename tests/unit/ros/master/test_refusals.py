@@ -10,14 +10,14 @@ from rosrm.ros.master.refusals import Refusals
 class Clock:
     now = 100.0
 
-    def monotonic(self) -> float:
+    def boot_time(self) -> float:
         return self.now
 
 
 def test_refusals_are_counted_by_kind(monkeypatch) -> None:
     """A stranger may have any number of names; another kind is recorded at once."""
     clock, recorded = Clock(), []
-    monkeypatch.setattr(refusals, "time", clock)
+    monkeypatch.setattr(refusals, "clocks", clock)
     refuse = Refusals(recorded.append)
     for number in range(1000):
         refuse("handshake", f"slave {number}", "another version")

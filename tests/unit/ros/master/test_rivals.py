@@ -24,14 +24,14 @@ class Watch:
 
     def __init__(self, monkeypatch) -> None:
         self.now = 100.0
-        monkeypatch.setattr(rivals, "time", self)
+        monkeypatch.setattr(rivals, "clocks", self)
         self.wire, self.refused = Wire(), []
         self.watch = RivalWatch(
             self.wire, IDENTITY, lambda who, reason: self.refused.append((who, reason))
         )
         monkeypatch.setattr(self.watch, "_endpoints", self.wire)
 
-    def monotonic(self) -> float:
+    def boot_time(self) -> float:
         return self.now
 
     @property

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from rosrm import clocks
 from rosrm.core.master.commands import Assign, SendOrder
 from rosrm.core.master.events import BAD_RESULT
 from rosrm.keys.cluster import ClusterSecret
@@ -156,8 +156,8 @@ def test_waiting_requests_of_one_slave_are_bounded(links):
 
 def test_readings_are_polled_for_a_slave_only_a_moment_after_its_registration(links, monkeypatch):
     """A request of a slave that has died since waits for ever, and must not occupy the master."""
-    now = time.monotonic()
-    monkeypatch.setattr("time.monotonic", lambda: now)
+    now = clocks.boot_time()
+    monkeypatch.setattr("rosrm.clocks.boot_time", lambda: now)
     links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
     before = links.awaits_first_readings
     links.after_first_reading(links.registered(HOST), lambda: None)

@@ -11,14 +11,14 @@ from rosrm.ros.master.strangers import Strangers
 class Clock:
     now = 1e6
 
-    def monotonic(self) -> float:
+    def boot_time(self) -> float:
         return self.now
 
 
 @pytest.fixture
 def clock(monkeypatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr(strangers, "time", clock)
+    monkeypatch.setattr(strangers, "clocks", clock)
     return clock
 
 

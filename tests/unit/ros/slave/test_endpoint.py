@@ -22,17 +22,17 @@ PERIOD_OF_MASTER = PERIOD
 
 
 class Clock:
-    """Clock in seconds; stands in for the module `time`."""
+    """Clock in seconds; stands in for `rosrm.clocks`."""
 
     now = 100.0
 
-    def monotonic(self) -> float:
+    def boot_time(self) -> float:
         return self.now
 
-    def monotonic_ns(self) -> int:
+    def boot_time_ns(self) -> int:
         return int(self.now * 1e9)
 
-    time_ns = monotonic_ns
+    wall_time_ns = boot_time_ns
 
 
 class Host:
@@ -63,7 +63,7 @@ class Master:
     ) -> None:
         beat = msg.MasterBeat(
             protocol_version=PROTOCOL_VERSION, incarnation=self._incarnation,
-            beat=self._slave.clock.monotonic_ns() - int(age * 1e9), silent_hosts=list(silent_hosts),
+            beat=self._slave.clock.boot_time_ns() - int(age * 1e9), silent_hosts=list(silent_hosts),
             journal=journal, tickets_from=tickets_from, **self._is,
         )  # fmt: skip
         self._slave.wire.hear[msg.MasterBeat](beat)
@@ -71,7 +71,7 @@ class Master:
     def greet(self) -> None:
         response = srv.Handshake.Response(
             protocol_version=PROTOCOL_VERSION, accepted=True, master="m",
-            beat=self._slave.clock.monotonic_ns(), **self._is,
+            beat=self._slave.clock.boot_time_ns(), **self._is,
         )  # fmt: skip
         self._slave.newest(srv.Handshake).answer(response)
 
@@ -133,7 +133,7 @@ class Slave:
 def slave(monkeypatch, caplog) -> Slave:
     caplog.set_level(logging.INFO)
     clock = Clock()
-    monkeypatch.setattr(endpoint, "time", clock)
+    monkeypatch.setattr(endpoint, "clocks", clock)
     return Slave(clock)
 
 
@@ -280,7 +280,7 @@ def test_a_beat_that_is_still_to_come_is_refused(slave, ahead) -> None:
     )
     slave.pass_time(40.0, ours)
     beat = slave.newest(srv.RequestProcess).request.envelope.receiver_beat
-    assert beat <= slave.clock.monotonic_ns()
+    assert beat <= slave.clock.boot_time_ns()
 
 
 def test_beats_of_others_do_not_disturb_a_registration(slave) -> None:
@@ -294,7 +294,7 @@ def test_beats_of_others_do_not_disturb_a_registration(slave) -> None:
     ours.beat()
     assert slave.link is MasterLink.REGISTERING
     envelope = slave.newest(srv.RegisterHost).request.envelope
-    assert envelope.receiver_beat == slave.clock.monotonic_ns()
+    assert envelope.receiver_beat == slave.clock.boot_time_ns()
 
 
 @pytest.mark.parametrize("period", [0.0, -1.0, float("nan"), float("inf"), 1e300])
@@ -403,7 +403,7 @@ def test_a_refused_registration_is_logged_once_and_retried(slave, caplog, code, 
 def test_the_journal_position_of_a_former_run_is_sent_back(monkeypatch, tmp_path) -> None:
     """A later run of the slave reports it, too; the same run of the master needs no report."""
     clock = Clock()
-    monkeypatch.setattr(endpoint, "time", clock)
+    monkeypatch.setattr(endpoint, "clocks", clock)
     path = tmp_path / "journal_seen"
     slave = Slave(clock, JournalWatermark(path))
     old = Master(slave, 11, epoch=2)

@@ -60,7 +60,8 @@ class McapFile:
             from mcap.writer import Writer  # noqa: PLC0415 - an optional dependency
         except ImportError:
             raise SkipPlugin("mcap is not installed: pip install 'rosrm-alerts[mcap]'") from None
-        start = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
+        now = datetime.now(timezone.utc)  # noqa: TID251 - a plugin imports public names only
+        start = now.strftime("%Y%m%dT%H%M%SZ")
         path = Path(options.file.replace("{time}", start)).expanduser()
         try:
             self._stream = path.open("xb")

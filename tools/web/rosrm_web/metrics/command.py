@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from rosrm import clocks
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, seconds_of
 from rosrm.errors import ConfigError, NoMaster
@@ -70,7 +71,7 @@ def _look(
     from rosrm_web.metrics.exposition import exposition
     from rosrm_web.watching import MOST_EVENTS
 
-    begun = time.monotonic()
+    begun = clocks.boot_time()
     try:
         listing = client.list(
             hosts=True, processes=True, applications=True, plugins="failing",
@@ -82,7 +83,7 @@ def _look(
         return exposition(None, 0.0, counted), after
     if counted is not None:
         counted.count(listing.events)
-    seconds = time.monotonic() - begun
+    seconds = clocks.boot_time() - begun
     load = client.master_load() if counted is not None else {}
     return exposition(listing, seconds, counted, load), listing.last_sequence
 

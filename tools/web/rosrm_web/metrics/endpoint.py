@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING
 
 from fastapi.responses import Response
 
+from rosrm import clocks
 from rosrm.errors import NoMaster
 from rosrm_web.metrics import table
 from rosrm_web.metrics.counting import EventMetrics
@@ -32,12 +32,12 @@ class Metrics:
     async def metrics(self) -> Response:
         """Return all metrics as text for Prometheus, also while the master is lost."""
         listing: Listing | None = None
-        begun = time.monotonic()
+        begun = clocks.boot_time()
         with suppress(NoMaster):
             listing = await self._gateway.list(
                 hosts=True, processes=True, applications=True, plugins="failing"
             )
-        seconds = time.monotonic() - begun
+        seconds = clocks.boot_time() - begun
         load = self._gateway.watcher.load
         own = [(table.TOKENS, (), float(bool(self._access.trouble)))]
         write = partial(exposition, listing, seconds, self._counted, load, own)

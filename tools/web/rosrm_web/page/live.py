@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
+from rosrm import clocks
 from rosrm.errors import RosrmError
 from rosrm_web.watching import give_up_early
 
@@ -79,7 +79,7 @@ class Live:
         while True:
             with suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._woken.wait(), PERIOD)
-            is_due = self._woken.is_set() or time.monotonic() >= self._whole_at
+            is_due = self._woken.is_set() or clocks.boot_time() >= self._whole_at
             self._woken.clear()
             await (self._read() if is_due else self._read_hosts())
             for call in list(self.on_change):
@@ -95,7 +95,7 @@ class Live:
                 self.listing = replace(self.listing, hosts=hosts.hosts, uptime=hosts.uptime)
 
     async def _read(self) -> None:
-        self._whole_at = time.monotonic() + WHOLE_PERIOD
+        self._whole_at = clocks.boot_time() + WHOLE_PERIOD
         try:
             if self.readers_of_applications:
                 self.listing = self.applications = await self._gateway.list(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from nicegui import background_tasks, ui
 
+from rosrm import clocks
 from rosrm.wording import duration
 from rosrm_web.page import timeline_chart, views
 from rosrm_web.page.timeline import STYLES, Picture, View, picture
@@ -219,11 +219,11 @@ class Timeline:
         options = self._chart.options
         options["xAxis"].update(edges)
         basis = (self._view, feed.newest, listing.last_sequence)
-        if basis == self._drawn and time.monotonic() - self._drawn_at < _OLD:
+        if basis == self._drawn and clocks.boot_time() - self._drawn_at < _OLD:
             made = self._made
         else:
             made = picture(feed.timeline, listing, self._view, self._now())
-            self._drawn, self._drawn_at = basis, time.monotonic()
+            self._drawn, self._drawn_at = basis, clocks.boot_time()
         if made == self._made:
             self._chart.run_chart_method("setOption", {"xAxis": edges})
             return
