@@ -651,7 +651,8 @@ class InstanceStatus:
         restarts: number of restarts by the restart policy on this host.
         peak_memory: peak memory of the last run in bytes; 0: unknown.
         cpu_time: CPU time of the last run in seconds.
-        run_time: seconds from start to end of the last run.
+        run_time: with a pid the seconds since the first start of the instance, by the boot clock of
+            its host; otherwise from start to end of the last run.
         message: text on why it failed or was refused, or runs without its limits.
         enforced: names of the limits and scheduling settings that hold in this run.
         devices: devices of its host that it holds.

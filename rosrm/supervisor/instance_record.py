@@ -189,6 +189,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "restarts": lambda value: messages.read_whole(value, 0, 2**31 - 1),
     "recent": _times,
     "started": messages.read_time,
+    "begun": _optional_time,
     "deadline": _optional_time,
     "step": lambda value: messages.read_whole(value, -1, len(STEPS) - 1),
     "kills": _int32,
@@ -209,7 +210,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
 }
 #: Fields that may be missing in older records.
 _NEW_FIELDS: Final = frozenset(
-    {"adopted", "enforced", "fault", "fenced", "heard", "kill_by", "slots", "withdrawn"}
+    {"adopted", "begun", "enforced", "fault", "fenced", "heard", "kill_by", "slots", "withdrawn"}
 )
 
 

@@ -205,11 +205,11 @@ class Status(NamedTuple):
     enforced: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, instance: Instance) -> Status:
+    def of(cls, instance: Instance, now: float) -> Status:
         """Return the status that is sent for an instance."""
-        return cls(
-            instance.key, instance.phase, *(getattr(instance, name) for name in cls._fields[2:])
-        )  # fmt: skip
+        fields = [getattr(instance, name) for name in cls._fields[2:]]
+        status = cls(instance.key, instance.phase, *fields)
+        return status._replace(run_time=instance.time_run(now))
 
 
 # --- orders -----------------------------------------------------------------------------------

@@ -36,6 +36,7 @@ from rosrm.supervisor import (
     spawn,
     takeover,
 )
+from rosrm.supervisor.boot_timer import BootTimer
 from rosrm.supervisor.confinement import Confined, Confinement, Steps
 from rosrm.supervisor.connection import Connection
 from rosrm.supervisor.instance_groups import LimitRefused
@@ -93,6 +94,7 @@ class Server:
         self._listener = listener
         self._files = files
         self._selector = selectors.DefaultSelector()
+        self._timer = BootTimer()
         self._core = SupervisorState()
         self._confinement = Confinement(state)
         self._groups = self._confinement.groups
@@ -123,6 +125,8 @@ class Server:
         Ended instances stay in the record; the next client to connect starts another supervisor.
         """
         self._watch(self._listener, self._accept)
+        if self._timer.descriptor >= 0:
+            self._watch(self._timer.descriptor, self._timer.clear)
         self._watch_signals()
         self._take_over()
         while True:
@@ -174,6 +178,7 @@ class Server:
         starts = self._starts.values()
         deadlines += [start.due if self._is_late(start) else start.late for start in starts]
         due = [deadline for deadline in deadlines if deadline is not None]
+        self._timer.set(min(due, default=None))
         return min(max(0.0, min(due) - clocks.boot_time()), LONGEST_WAIT) if due else None
 
     def _leave(self) -> None:
@@ -215,7 +220,7 @@ class Server:
             elif instance.started or instance.phase == BACKOFF:  # else they may be made ahead
                 self._groups.remove(key, clocks.boot_time())
         self._record.state(instance, self._trees.birth(key), self._groups.kills_before(key))
-        status = messages.Status.of(instance)
+        status = messages.Status.of(instance, clocks.boot_time())
         # The slave has ordered the start, and most spawns take a moment. So `starting` is sent only
         # if the spawn cannot begin in this round, or is late.
         self._first_starts.pop(key, None)
@@ -551,7 +556,8 @@ class Server:
         self._logs.limits = hello.log
         self._unsent.clear()  # the welcome's statuses hold all of these changes
         self._first_starts.clear()
-        statuses = [messages.Status.of(instance) for instance in self._core.instances.values()]
+        now = clocks.boot_time()
+        statuses = [messages.Status.of(one, now) for one in self._core.instances.values()]
         memos = {key: launch.memo for key, launch in self._launches.items() if launch.memo}
         fenced = [one.key for one in self._core.instances.values() if one.fence is not None]
         self._record.flush()
@@ -671,7 +677,7 @@ class Server:
         if signal.SIGTERM in numbers:
             self._happened(events.ShutdownOrdered())
 
-    def _watch(self, file: socket.socket | Connection, call: Callable[[], None]) -> None:
+    def _watch(self, file: socket.socket | Connection | int, call: Callable[[], None]) -> None:
         self._selector.register(file, selectors.EVENT_READ, call)
 
 

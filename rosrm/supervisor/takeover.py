@@ -51,6 +51,7 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
 def _restart_clock(instance: Instance, now: float) -> None:
     """Restart the clock of an instance recorded in an earlier boot; its deadlines are due now."""
     instance.recent.clear()  # times of the former boot may lie ahead, and would count for hours
+    instance.begun = None
     if instance.pid:
         instance.fault = "its machine was restarted"
     if instance.deadline is not None:

@@ -139,6 +139,13 @@ def _note_load(
         settle_reservation(state, instance, now)
 
 
+def _note_facts(instance: Instance, status: InstanceStatus, now: float) -> None:
+    instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
+    instance.message, instance.enforced = status.message, status.enforced
+    if status.pid and not status.state.ended:
+        instance.began = min(instance.began, now - status.run_time)
+
+
 def take_status(state: MasterState, host: Host, status: InstanceStatus, now: float) -> None:
     """Apply the status of one instance."""
     instance = state.instances.get(status.instance.number)
@@ -147,8 +154,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     status = _bounded(status)
     before, pid = instance.state, instance.pid
-    instance.state, instance.pid, instance.restarts = status.state, status.pid, status.restarts
-    instance.message, instance.enforced = status.message, status.enforced
+    _note_facts(instance, status, now)
     _note_load(state, instance, before, now)
     state.note_held(instance, status.devices)
     if status.state.ended:
@@ -165,8 +171,8 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
     process = state.owned_by(instance)
     if process is None:
         return
-    if status.state in _ALIVE and not process.began:
-        _note_start(state, process, now)
+    if status.state in _ALIVE:
+        _note_start(state, process, status, now)
     adoption.note_running(state, process, instance)
     _note_restarts(state, process, status, before, pid)
     if process.wanted is not DesiredState.RUN and not instance.stopping:
@@ -179,9 +185,17 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         _follow(state, process, instance, status, now, repeated=before is status.state)
 
 
-def _note_start(state: MasterState, process: Process, now: float) -> None:
-    """Note the first start of a process since it left the queue."""
-    process.started_at, process.began = now, state.wall
+def _note_start(
+    state: MasterState, process: Process, status: InstanceStatus, now: float
+) -> None:  # fmt: skip
+    """Note the first start of a process since it left the queue, and for how long it has run."""
+    if not process.began:
+        process.started_at = now
+    if status.pid:
+        process.note_run_time(status.run_time, now)
+    if process.began:
+        return
+    process.began = state.wall
     if process.spec.schedule and not process.next_run:
         process.next_run = process.spec.schedule.next_run(state.wall)
     state.save(process)

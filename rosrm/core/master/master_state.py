@@ -435,7 +435,7 @@ class MasterState:
             process.next_spec = None
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue, process.cancel_cause = DesiredState.RUN, False, ""
-        process.started_at, process.began = inf, 0.0
+        process.started_at, process.began, process.ran_before = inf, 0.0, 0.0
         process.restart_due, process.strays_until = False, 0.0
         self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)

@@ -384,11 +384,19 @@ def _follow(
     else:
         held.ready_by = held.steering = held.loading = None
         held.status = _with_unready(held, reported)
+    _note_begin(held, reported, now)
     state.hold(reported.instance, held)
     if held.status.state.ended:
         held.ended_at = now
         _bury(state, reported.instance)
     return held.status
+
+
+def _note_begin(held: HeldInstance, reported: InstanceStatus, now: float) -> None:
+    """Note the start of the first run, which an earlier run of this slave may have seen."""
+    if reported.pid and not reported.state.ended:
+        began = now - reported.run_time
+        held.began = began if held.began is None else min(held.began, began)
 
 
 def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:

@@ -52,9 +52,10 @@ from rosrm.core.slave.state import SlaveState
 def step(state: SlaveState, event: Event, now: float) -> Sequence[Command]:
     """Handle one event, and change the state in place.
 
-    `now` is the slave's monotonic clock, in seconds; never less than before.
+    `now` is the slave's boot clock, in seconds; never less than before.
     """
-    commands = [_with_devices(state, one) for one in HANDLERS[type(event)](state, event, now)]
+    state.now = now
+    commands = [_as_reported(state, one) for one in HANDLERS[type(event)](state, event, now)]
     if not state.registered and any(isinstance(command, Report) for command in commands):
         state.report_unconfirmed = True
     return commands
@@ -77,8 +78,8 @@ def _without_dropped(state: SlaveState, launch: Launch) -> Launch:
     return replace(launch, assignments=wanted)
 
 
-def _with_devices(state: SlaveState, command: Command) -> Command:
-    """Return a report with the devices of the instances; another command unchanged."""
+def _as_reported(state: SlaveState, command: Command) -> Command:
+    """Return a report with the facts that only the slave knows; another command unchanged."""
     if not isinstance(command, Report):
         return command
-    return Report(state.with_devices(command.statuses), command.complete)
+    return Report(state.reported(command.statuses), command.complete)

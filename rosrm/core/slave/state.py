@@ -79,6 +79,8 @@ class HeldInstance:
         unsettled: amendments that the master has ordered and the supervisor has not recorded yet,
             in order.
         ended_at: time of its end, or of the report of the end to a newly registered master.
+        began: start of its first run; None: it has not started.
+        amended: what the master has changed since the assignment; None: nothing.
         devices: devices that it holds.
         artifacts: artifacts that it uses.
         lifecycle: None: the slave does not change the lifecycle state of its node.
@@ -98,6 +100,8 @@ class HeldInstance:
     unready: str = ""
     unsettled: tuple[Amendment, ...] = ()
     ended_at: float = 0.0
+    began: float | None = None
+    amended: Amendment | None = None
     devices: tuple[HeldDevice, ...] = ()
     artifacts: tuple[Artifact, ...] = ()
     lifecycle: ManagedLifecycle | None = None
@@ -131,6 +135,7 @@ class SlaveState:
     """The state of the slave's core.
 
     Attributes:
+        now: time of the newest event.
         max_processes: highest number of running processes; 0: no bound.
         max_starting: highest number of processes that are starting and not ready; 0: no bound.
         max_age: age in seconds from which an assignment is not accepted.
@@ -150,6 +155,7 @@ class SlaveState:
         tombstones: ended and refused instances, which never start on this host again.
     """
 
+    now: float = 0.0
     max_processes: int = 0
     max_starting: int = 0
     max_age: float = inf
@@ -208,16 +214,21 @@ class SlaveState:
 
     def statuses(self) -> tuple[InstanceStatus, ...]:
         """Return the status of every instance, including ended ones that may still be reported."""
-        return self.with_devices(held.status for held in self.held.values())
+        return self.reported(held.status for held in self.held.values())
 
-    def with_devices(self, statuses: Iterable[InstanceStatus]) -> tuple[InstanceStatus, ...]:
-        """Return the statuses with the devices that the instances hold."""
-        return tuple(
-            replace(status, devices=held.devices)
-            if (held := self.held.get(status.instance)) is not None and held.devices
-            else status
-            for status in statuses
-        )
+    def reported(self, statuses: Iterable[InstanceStatus]) -> tuple[InstanceStatus, ...]:
+        """Return the statuses with the devices that the instances hold, and their time so far."""
+        return tuple(self._reported(status) for status in statuses)
+
+    def _reported(self, status: InstanceStatus) -> InstanceStatus:
+        held = self.held.get(status.instance)
+        if held is None:
+            return status
+        if held.devices:
+            status = replace(status, devices=held.devices)
+        if status.pid and held.began is not None and not status.state.ended:
+            status = replace(status, run_time=max(0.0, self.now - held.began))
+        return status
 
     def slots(self) -> int:
         """Return the number of further instances that `max_processes` allows to run."""

@@ -48,6 +48,7 @@ class Instance:
         then: next action once none of its processes is left; "": it is not being stopped.
         pid: pid of its session leader; 0: none.
         started: start of its last run.
+        begun: start of its first run; None: it has not started.
         recent: times of the restarts within the policy's window.
         deadline: time of the next step (signal or restart); None: none is due.
         kills: number of SIGKILLs in this stop.
@@ -67,7 +68,7 @@ class Instance:
     """
 
     __slots__ = (
-        "adopted", "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault",
+        "adopted", "begun", "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault",
         "fence", "fenced", "heard", "key", "kill_by", "kills", "message", "peak_memory",
         "phase", "pid", "recent", "restart", "restarts", "run_time", "slots", "started",
         "step", "stop", "stop_began", "then", "trail", "withdrawn",
@@ -92,6 +93,7 @@ class Instance:
         self.restarts = 0
         self.recent: list[float] = []
         self.started = 0.0
+        self.begun: float | None = None
         self.deadline: float | None = None
         self.step = -1
         self.kills = 0
@@ -108,6 +110,15 @@ class Instance:
     def ended(self) -> bool:
         """Return True if no process of the instance runs, and none will."""
         return self.phase in ENDED
+
+    def time_run(self, now: float) -> float:
+        """Return the seconds since the start of its first run; without a process, of its last run.
+
+        A restart does not begin a new time limit, so the whole time counts while it runs.
+        """
+        if not self.pid or self.begun is None:
+            return self.run_time
+        return max(0.0, now - self.begun)
 
     @property
     def fence_at(self) -> float | None:

@@ -52,6 +52,7 @@ def _spawned(instance: Instance, event: events.Event, now: float) -> list[Comman
     instance.phase = RUNNING
     instance.pid = event.pid
     instance.started = now
+    instance.begun = now if instance.begun is None else instance.begun
     instance.message, instance.fault = event.note, ""
     instance.enforced = event.enforced
     instance.adopted = event.adopted

@@ -27,8 +27,9 @@ ALWAYS = RestartPolicy("always", delay=0.05)
 
 #: A slave that renews the lease continually, with a fenced singleton and an unfenced driver.
 SLAVE = """
-    import os, sys, time
+    import os, sys
     from pathlib import Path
+    from rosrm import clocks
     from rosrm.core.supervisor.events import ContactReported
     from rosrm.model.values import Fence, InstanceId
     from rosrm.supervisor.client_values import LaunchOrder

@@ -201,9 +201,11 @@ class Cluster(World[Machine]):
         intents: durable tables, as in the journal: table -> key -> value, as JSON has it.
         carried: every command that was carried out.
         watch: called with the commands of each step before they are carried out.
+        clock_set_by: seconds by which the master's clock of the day was set.
     """
 
     now = 100.0
+    clock_set_by = 0.0
 
     def __init__(
         self, *machines: Machine | str, policy: Any = None, strategies: Mapping[str, Any] = EMPTY,
@@ -237,7 +239,7 @@ class Cluster(World[Machine]):
     @property
     def wall(self) -> float:
         """Unix time."""
-        return 1.7e9 + self.now
+        return 1.7e9 + self.clock_set_by + self.now
 
     def __getitem__(self, name: str) -> Process:
         return self.state.processes[name]

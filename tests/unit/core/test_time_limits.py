@@ -8,6 +8,11 @@ from rosrm.model.values import HostLossPolicy, RestartPolicy
 from tests.unit.core.cluster import Cluster, job, movable
 
 
+def lose_and_return(cluster: Cluster) -> None:
+    cluster.cut("a", seconds=4.0)
+    cluster.reconnect("a", seconds=1.0)
+
+
 def test_a_job_that_runs_longer_than_its_time_limit_has_failed() -> None:
     """The slave stops it; its end is recorded with the limit."""
     cluster = Cluster("a").with_processes(job("p", time_limit=5.0))
@@ -116,3 +121,51 @@ def test_a_job_that_is_cancelled_while_it_is_overdue_is_cancelled() -> None:
     cluster.cancel("p")
     cluster.let_go("p")
     assert cluster.phase("p") == "cancelled"
+
+
+YEARS = 56 * 365.25 * 86400.0
+
+
+@pytest.mark.parametrize("seconds", [YEARS, -YEARS])
+@pytest.mark.parametrize("fault", [Cluster.restart_master, lose_and_return])
+def test_a_clock_that_is_set_changes_no_time_limit(fault, seconds) -> None:
+    """The host reports for how long the job has run; unix time says nothing about that."""
+    cluster = Cluster("a", lease=1.0, suspect=0.5)
+    cluster.submit(job("p", time_limit=20.0, host_loss=HostLossPolicy("elsewhere", 0.0)))
+    cluster.wait(2.0)
+    cluster.clock_set_by = seconds
+    fault(cluster)
+    started = 100.0
+    cluster.wait(started + 19.5 - cluster.now)
+    assert cluster.phase("p") == "running"
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "failed"
+
+
+def test_a_moved_job_keeps_its_time_when_the_master_restarts() -> None:
+    """Its new host knows only the time since the move; the journal has the time before."""
+    cluster = Cluster("a")
+    cluster.submit(movable("p", kind=job("p").kind, time_limit=10.0))
+    cluster.wait(4.0)
+    cluster.add("b")
+    assert cluster.migrate("p", "b").accepted
+    cluster.wait(2.0)
+    assert cluster.where("p") == ["b"]
+    cluster.clock_set_by = YEARS
+    cluster.restart_master()
+    cluster.wait(3.5)
+    assert cluster.phase("p") == "running"
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "failed"
+
+
+def test_a_restarted_job_reports_its_time_since_its_first_start() -> None:
+    """A restart by its policy begins no new time limit, also for a master that restarts."""
+    cluster = Cluster("a")
+    cluster.submit(job("p", time_limit=10.0, restart=RestartPolicy("on-failure")))
+    cluster.wait(6.0)
+    cluster.finish("p", code=1)
+    cluster.wait(1.0)
+    cluster.restart_master()
+    cluster.wait(3.5)
+    assert cluster.phase("p") == "failed"

@@ -11,7 +11,7 @@ import pytest
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Signal, Unspawn
-from rosrm.core.supervisor.instance import BACKOFF, EXITED, FAILED, FENCED
+from rosrm.core.supervisor.instance import BACKOFF, EXITED, FAILED, FENCED, STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 
@@ -209,3 +209,28 @@ def test_an_instance_fenced_while_it_is_stopped_is_not_restarted_on_order():
     core.handle(events.RestartOrdered(ONE), 2.0)
     core.handle(events.Exited(ONE, signal=9), 2.5)
     assert instance.phase == FENCED
+
+
+def test_the_first_step_after_a_suspend_ends_a_fenced_instance():
+    """A machine that slept longer than the fence and its grace leaves no time for other signals."""
+    core, _ = running(heard=0.0)
+    core.handle(events.ContactReported(2.0, 2.0), 2.0)
+    commands = core.handle(events.TimePassed(), 602.0)
+    assert [one.number for one in commands if isinstance(one, Signal)] == [signal.SIGKILL]
+
+
+def test_a_slave_that_sleeps_too_renews_no_fence():
+    """After the resume it knows only the contact before, so its first word postpones nothing."""
+    core, instance = running(heard=0.0)
+    core.handle(events.ContactReported(2.0, 602.0), 602.0)
+    core.handle(events.TimePassed(), 602.0)
+    assert instance.phase == STOPPING
+
+
+def test_the_reported_run_time_counts_a_suspend_and_all_runs():
+    """The master ends a job by this time, whatever its own clock says."""
+    core, instance = running(fence=None)
+    core.handle(events.Exited(ONE, code=1), 50.0)
+    core.handle(events.TimePassed(), core.deadline())
+    core.handle(events.Spawned(ONE, 101), 55.0)
+    assert (instance.time_run(605.0), instance.run_time) == (605.0, 50.0)

@@ -165,7 +165,7 @@ def check_record(state):
     for event in (events.TimePassed(), events.ContactReported(1.0), events.ShutdownOrdered()):
         core.handle(event, clocks.boot_time())
     for instance in core.instances.values():
-        messages.encode_status(messages.Status.of(instance))
+        messages.encode_status(messages.Status.of(instance, 0.0))
         core.handle(events.FencePassed(instance.key), clocks.boot_time())
     record = instance_record.InstanceRecord(str(state))
     record.rewrite(core, recorded.launches, recorded.environments, lambda key: 0)

@@ -582,7 +582,7 @@ class Host(RuleBasedStateMachine):
         return instance.phase != HELD and not instance.ended
 
     def check_status(self, key):
-        status = messages.Status.of(self.core.instances[key])
+        status = messages.Status.of(self.core.instances[key], self.now)
         if key in self.final:
             assert status == self.final[key], "a second final status"
         elif status.state in ENDED:

@@ -135,6 +135,7 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
         process.left_behind = LeftBehind(
             instance.id.number, host.name, instance.node_name, process.began, instance.spec
         )
+        process.ran_before = process.ran_before_owner(instance)
     requeue = instance.spec.host_loss.then != "stop"
     lifecycle.gone(state, instance, now, why, requeue=requeue)
 

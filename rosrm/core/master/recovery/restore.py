@@ -94,7 +94,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     process = Process(
         spec=from_plain(ProcessSpec, item["spec"]), phase=phase,
         since=now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
-        ended_on=item["host"],
+        ended_on=item["host"], ran_before=float(item.get("ran_before", 0.0)),
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
     )  # fmt: skip
@@ -103,7 +103,6 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     if not item.get("amended", True):
         limits = not item.get("limits_amended", False)  # absent in older journals
         state.unamended[process.name] = PendingAmendment(limits)
-    process.set_start(process.began, state.wall, now)
     if not process.is_at_rest:
         process.exit_code, process.ended_on = None, ""
     state.add_process(process)

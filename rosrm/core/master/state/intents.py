@@ -88,6 +88,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
             "left_behind": left and to_plain(left),
             "image": process.image and to_plain(process.image),
             **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
+            "ran_before": process.ran_before_owner(owner),
             "excluded": dict(process.excluded),
             "failed_on": process.failed_on and to_plain(process.failed_on),
             "amended": pending is None, "limits_amended": pending is None or not pending.limits,

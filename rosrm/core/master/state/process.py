@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from math import inf
+from math import inf, isinf
 from typing import Any, Final
 
 from rosrm.core.master.graph_names import node_of
@@ -97,6 +97,7 @@ class Instance:
         ready_at: time at which the first report of its readiness arrived at this master.
         devices: devices of its host that it holds.
         stray: its host reports it, and the master has not assigned it to that host.
+        began: its first start, as its host reports; inf: unknown.
     """
 
     id: InstanceId
@@ -125,6 +126,7 @@ class Instance:
     ready_at: float = inf
     devices: tuple[HeldDevice, ...] = ()
     stray: bool = False
+    began: float = inf
 
     @property
     def is_running(self) -> bool:
@@ -251,8 +253,11 @@ class Process:
         standby_at: time before which no standby is started.
         standby_tries: number of standbys that were lost in a row.
         standby_reason: condition of its standby, for listings.
-        started_at: time at which it first started since it left the queue; inf: not yet.
-        began: unix time of `started_at`; 0: not yet.
+        started_at: time at which it first started since it left the queue; inf: not yet, or its
+            host has not yet reported for how long it has run.
+        began: unix time of `started_at`, for people; 0: not yet.
+        ran_before: seconds from that start to the start of its owner, after moves, as a former
+            master or a lost host left it.
         overdue: True: its time limit has passed, and it is being stopped.
         cancel_cause: why it is, or was, cancelled without a request of a client; "": it was not.
         awaits_gang: True: it has a gang, and has not started since it was submitted; so it is
@@ -301,6 +306,7 @@ class Process:
     standby_reason: str = ""
     started_at: float = inf
     began: float = 0.0
+    ran_before: float = 0.0
     overdue: bool = False
     cancel_cause: str = ""
     awaits_gang: bool = False
@@ -350,15 +356,20 @@ class Process:
         """Return the time from which a queued process may be placed."""
         return self.since + self.queue_delay
 
-    def set_start(self, began: float, wall: float, now: float) -> None:
-        """Set the time of its first start, which a former master or a lost host knows.
+    def note_run_time(self, seconds: float, now: float) -> None:
+        """Note for how long its owner has run, by the clock of that host.
 
-        Args:
-            began: unix time of the start; 0: it has not started.
-            wall: unix time now; it may be earlier than the start, if the clock was set back.
+        Only the host knows that after a restart of the master or a loss of the host: unix time may
+        have been set since, and says nothing about a duration.
         """
-        self.began = began
-        self.started_at = now - max(0.0, wall - began) if began else inf
+        self.started_at = min(self.started_at, now - self.ran_before - seconds)
+
+    def ran_before_owner(self, owner: Instance | None) -> float:
+        """Return the seconds from its first start to that of its owner."""
+        if owner is None or isinf(owner.began) or isinf(self.started_at):
+            return self.ran_before
+        return max(0.0, owner.began - self.started_at)
+
 
 
 def ends_group(process: Process) -> bool:
