@@ -1,7 +1,7 @@
 """Times of the last contact with the master and of the slave's last activity, for a take-over.
 
 The file `heard` of the state directory holds one line of fixed length, which is overwritten: the
-id of this boot, and the two times by its CLOCK_MONOTONIC. So it needs no room on a full disk, and
+id of this boot, and the two times by its boot clock. So it needs no room on a full disk, and
 no compaction. Where it is missing, the recorded start of each instance counts.
 """
 

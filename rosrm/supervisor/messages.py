@@ -30,7 +30,7 @@ The client sends orders; the key `do` names the order:
                                                 instance: as with stop
     heard        at, alive                      last contact: the master received a message of this
                                                 host at `at`, the client worked at `alive`
-                                                (CLOCK_MONOTONIC). An instance with a fence is
+                                                (CLOCK_BOOTTIME). An instance with a fence is
                                                 ended `after` seconds after the newest `at` (with
                                                 `alive` in the fence: after the newest of both),
                                                 by SIGKILL `grace` seconds later

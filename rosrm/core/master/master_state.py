@@ -435,7 +435,9 @@ class MasterState:
             process.next_spec = None
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue, process.cancel_cause = DesiredState.RUN, False, ""
-        process.started_at, process.began, process.ran_before = inf, 0.0, 0.0
+        process.started_at, process.began = inf, 0.0
+        if process.left_behind is None:
+            process.ran_before = 0.0
         process.restart_due, process.strays_until = False, 0.0
         self.flows.note_change(process.name)
         self.set_phase(process, ProcessPhase.QUEUED, now, reason)
@@ -636,7 +638,7 @@ class MasterState:
 
     def clear_left_behind(self, process: Process) -> None:
         """Note that no instance of a process on a lost host counts as its own any more."""
-        process.left_behind = None
+        process.left_behind, process.ran_before = None, 0.0
         self.neighbours.note_change(process.name)
 
     def assignment(

@@ -58,7 +58,7 @@ def _readopt(
     # report it.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
     process.owner, process.left_behind = left.number, None
-    process.began, process.ran_before = left.began, left.ran_before
+    process.began = left.began
     state.set_phase(process, ProcessPhase.STARTING, now)
     state.record(
         now, EventKind.READOPTED, f"{host.name} reports again: {instance.id} still runs there",
