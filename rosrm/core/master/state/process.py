@@ -371,7 +371,6 @@ class Process:
         return max(0.0, owner.began - self.started_at)
 
 
-
 def ends_group(process: Process) -> bool:
     """Return True if a process has ended in a way that ends its group, too."""
     return process.phase in _ENDS_GROUP[process.spec.group.ends]
