@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.errors import RosrmError
 
 #: Seconds for a call.
@@ -107,7 +107,7 @@ class PathCalls:
 
     def __init__(
         self, name: str, post: Callable[[Callable[[], None]], None], *,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clocks.boot_time,
     ) -> None:  # fmt: skip
         self._name, self._post, self._clock = name, post, clock
         self._lane: _Lane | None = None
