@@ -62,6 +62,7 @@ class EventKind(str, Enum):
     CANCELLED = "cancelled", "the process ended because it was cancelled"
     OVERDUE = "overdue", "the time limit of the job has passed: it is stopped, and has failed"
     RESTART_REQUESTED = "restart_requested", "a client restarts the process"
+    RESTART_REFUSED = "restart_refused", "a process was not restarted in place, with the reason"
     RUN_SKIPPED = (
         "run_skipped",
         "the former run of the job has not ended at the time of the next one",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rosrm.core.master import events as happened
-from rosrm.core.master import reloading, start_order
+from rosrm.core.master import reloading, restarts
 from rosrm.core.master.applications import amendments
 from rosrm.core.master.checkpoint import images, periodic, replication
 from rosrm.core.master.hosts import capabilities, links
@@ -11,7 +11,6 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import steps
 from rosrm.core.master.state.pending_orders import (
     CapabilityQuery,
-    DependencyRestart,
     ImageRemoval,
     InstanceAmendment,
     LinkMeasurement,
@@ -19,6 +18,7 @@ from rosrm.core.master.state.pending_orders import (
     PeriodicCheckpoint,
     Reload,
     Replication,
+    Restart,
 )
 
 
@@ -42,7 +42,7 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             links.note_answer(state, host, event, now)
         case Reload(host):
             reloading.note_answer(state, host, event, now)
-        case DependencyRestart():
-            start_order.note_answer(state, purpose, event)
+        case Restart():
+            restarts.note_answer(state, purpose, event, now)
         case ImageRemoval(number):
             images.note_answer(state, number, event, now)

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
-from rosrm.core.master import adoption, dependants
+from rosrm.core.master import adoption, dependants, restarts
 from rosrm.core.master import events as happened
 from rosrm.core.master.assignment.prefetch import learn_run_time, review_slots
 from rosrm.core.master.assignment.reservations import learn_from, settle_reservation
@@ -21,7 +21,7 @@ from rosrm.core.master.state.learned_needs import NO_NEEDS
 from rosrm.core.master.state.migration import End, Migration
 from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.orders import FenceInstance, Order, ReportInstances, StopInstance
+from rosrm.model.orders import FenceInstance, Order, StopInstance
 from rosrm.model.plan import Start
 from rosrm.model.sizes import size_of
 from rosrm.model.values import (
@@ -60,8 +60,6 @@ _EVENT: Final = {
 _MOST_STRAYS: Final = 256
 #: Most letters and entries of the status of an instance.
 _LARGEST_STATUS: Final = 10_000
-#: Reported states that show that the slave has begun to restart the instance.
-_RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
 #: Reported states in which nothing of the instance runs, and so the readings do not show it.
 _DOWN: Final = frozenset({InstanceState.STARTING, InstanceState.BACKOFF})
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
@@ -81,12 +79,13 @@ def statuses_received(state: MasterState, event: happened.StatusesReceived, now:
     note_on_host(state, host, event.failing_plugins(), now)
     note_devices(state, host, event.devices, now)
     if event.complete:
-        state.missing_since.pop(host.column, None)
-        state.hosts.set_report_due(host, report_due=False)
+        state.note_report(host)
         reconcile(state, host, event.statuses, now)
+        for instance in state.instances_of(host):
+            restarts.review(state, instance, now)  # a repeated order may have waited for the report
         return
-    if place == "after a gap":
-        state.send(host, ReportInstances())
+    if place == "after a gap" and host.column not in state.reports_awaited:
+        state.ask_for_report(host, now)
     for status in event.statuses:
         take_status(state, host, status, now)
 
@@ -164,10 +163,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         return
     if status.state in _ALIVE:
         instance.recalled = False
-    # After a back-off before the first run, the slave need not report the new start as one.
-    started_at_last = before is InstanceState.BACKOFF and status.state in _ALIVE
-    if status.state in _RESTARTS or started_at_last:
-        instance.restarting = False
+    restarts.note_status(state, instance, status)
     process = state.owned_by(instance)
     if process is None:
         return
@@ -362,7 +358,7 @@ def _ended(
         return
     if migration is not None:
         return  # the current plan handles this end
-    if instance.restarting:  # the instance ended before the order to restart arrived
+    if restarts.was_missed(instance, status, now):
         missed = replace(status, message="it ended before it was restarted")
         end = End(missed, gone=True)
     conclude(state, process, end, instance.host, now)

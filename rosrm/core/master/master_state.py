@@ -15,6 +15,7 @@ from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.applications import Application, Version
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.capabilities import Answer
 from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.flows import Flows
@@ -53,7 +54,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import Plain
 from rosrm.model.ledger import Ledger
 from rosrm.model.modes import Mode
-from rosrm.model.orders import Order
+from rosrm.model.orders import Order, ReportInstances
 from rosrm.model.records import Intent, Record
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.sizes import size_of
@@ -73,6 +74,8 @@ _LONGEST_RECORD: Final = 10_000
 #: Key of a spec in the ledger: that of a process, or of a version of an application.
 SpecKey = tuple[str, str, int]
 PROCESS: Final = "process"
+#: First and longest time, in seconds, until the order to report all instances is repeated.
+REPORT_WAITS: Final = (1.0, 16.0)
 #: Seconds between two records of the same kind about the same host.
 RECORD_PERIOD: Final = 10.0
 
@@ -102,6 +105,9 @@ class MasterState:
         terminal: names of the terminal processes, in the order in which they ended.
         unamended: name of each process whose slave has not changed the running instance yet, to the
             change.
+        missing_since: column of a host whose reading shows a missing status batch, to the time.
+        reports_awaited: column of a host that must report all of its instances, to the back-off of
+            the order.
         ended_members: principal and name of each group that has to end, because one of its
             processes has ended in this step, to the first such process.
         standbys: process name to the migration whose destination is its standby.
@@ -182,6 +188,7 @@ class MasterState:
         self.held_since = inf
         self.journal_gap = JournalGap()
         self.missing_since: dict[int, float] = {}
+        self.reports_awaited: dict[int, Backoff] = {}
         self.stranger_refused_at = -inf
         self.ahead_since: dict[int, tuple[float, int]] = {}
         self.reviewed = -inf
@@ -280,6 +287,18 @@ class MasterState:
         order_id = self.pending_orders.add(purpose)
         self.emit(SendOrder(order_id, host.host_id, order))
         return order_id
+
+    def ask_for_report(self, host: Host, now: float) -> None:
+        """Order a report of all instances of a host; the tick repeats it until one arrives."""
+        awaited = self.reports_awaited[host.column] = Backoff()
+        awaited.note(now, *REPORT_WAITS)
+        self.send(host, ReportInstances())
+
+    def note_report(self, host: Host) -> None:
+        """Note that a host has reported all of its instances."""
+        self.reports_awaited.pop(host.column, None)
+        self.missing_since.pop(host.column, None)
+        self.hosts.set_report_due(host, report_due=False)
 
     # --- processes -----------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ from collections.abc import Set as AbstractSet
 from typing import Final
 
 from rosrm.core.master import events as happened
+from rosrm.core.master import restarts
 from rosrm.core.master.adoption import check_adoption
 from rosrm.core.master.assignment.assign import assign_to_adopt, reconsider_set_aside
 from rosrm.core.master.assignment.gangs import check_gangs
@@ -41,7 +42,6 @@ from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.adoption_rules import adoption_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.limits import limits_fault
-from rosrm.model.orders import RestartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.stop_rules import stop_fault
 from rosrm.model.values import InstanceState, ProcessSpec
@@ -400,8 +400,7 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
     elif (owner := state.instances[process.owner]).state not in (None, InstanceState.HELD):
         # An instance that has not started yet starts without this order. An order to restart that
         # arrives before the assignment would prevent the start for good.
-        owner.restarting = True
-        state.send(owner.host, RestartInstance(owner.id))
+        restarts.begin(state, process, owner, now)
     state.save(process)
 
 

@@ -20,17 +20,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import inf
 from typing import Final
 
-from rosrm.core.master import events as happened
-from rosrm.core.master import lifecycle
+from rosrm.core.master import lifecycle, restarts
 from rosrm.core.master.dependants import awaited_ends, waits_for_ends
-from rosrm.core.master.events import OrderOutcome
 from rosrm.core.master.master_state import MasterState
-from rosrm.core.master.state.pending_orders import DependencyRestart
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
 from rosrm.model.description_checks import other_process_fault
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.orders import RestartInstance
 from rosrm.model.values import InstanceState, Kind, ProcessSpec, StartCondition
 from rosrm.wording import listed, no_such, standing
 
@@ -150,24 +146,8 @@ def _review_restart(state: MasterState, process: Process, now: float) -> None:
         f"starts was restarted",
         process=process.name, host=owner.host.name,
     )  # fmt: skip
-    owner.restarting = True
-    purpose = DependencyRestart(process.name, owner.id.number)
-    state.send(owner.host, RestartInstance(owner.id), purpose)
-
-
-def note_answer(
-    state: MasterState, purpose: DependencyRestart, event: happened.OrderAnswered
-) -> None:
-    """Note the answer of a slave to an order to restart; without an answer, order it again."""
-    process, owner = state.processes.get(purpose.process), state.instances.get(purpose.number)
-    if process is None or owner is None or process.owner != purpose.number:
-        return
-    if event.outcome is OrderOutcome.TIMEOUT:
-        owner.restarting = False
-        state.start_orders.note_change(process.name)
-    else:  # a slave refuses the order only if the instance has ended
-        process.restart_due = False
-        state.save(process)
+    process.restart_due = False
+    restarts.begin(state, process, owner, now, follows=True)
 
 
 # --- stops ------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from rosrm.core.master import events as happened
+from rosrm.core.master import restarts
 from rosrm.core.master.applications import amendments, rollout
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
@@ -17,7 +18,7 @@ from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.hosts.registration import review_departures
 from rosrm.core.master.lifecycle import stop_instance
-from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.master_state import REPORT_WAITS, MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
 from rosrm.core.master.migration.preemption import preempt
 from rosrm.core.master.migration.rebalancing import review_rebalancing
@@ -27,6 +28,8 @@ from rosrm.core.master.modes import switching
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.schedules import review_schedules
 from rosrm.core.master.start_order import review_stops
+from rosrm.core.master.state.backoff import Backoff
+from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
 from rosrm.core.master.time_limits import review_time_limits
 from rosrm.model.orders import ReportInstances
@@ -45,6 +48,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     if now - state.reviewed < _REVIEW_EVERY:
         return
     state.reviewed = now
+    _ask_for_missing_statuses(state, now)
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
     amendments.review(state, now)
@@ -56,7 +60,6 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     review_lost_hosts(state, now)
     journal_gap.review(state, now)
     review_standbys(state, now)
-    _ask_for_missing_statuses(state, now)
     _review_forged_batches(state, now)
     capabilities.ask_hosts(state, now)
     links.ask_next_host(state, now)
@@ -80,6 +83,7 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
         _cancel_prefetch(state, instance, now)
     if instance.stopping and now - instance.order_at >= state.settings.order_retry:
         stop_instance(state, instance, now)
+    restarts.review(state, instance, now)
     review_reservation(state, instance, now)
 
 
@@ -127,8 +131,12 @@ def _ask_for_missing_statuses(state: MasterState, now: float) -> None:
     for column in missing:
         since = state.missing_since.setdefault(column, now)
         if now - since >= _PATIENCE:
-            state.missing_since[column] = now
-            state.send(state.hosts.hosts[column], ReportInstances())
+            state.reports_awaited.setdefault(column, Backoff())
+    for column, awaited in state.reports_awaited.items():
+        host = state.hosts.hosts[column]
+        if now >= awaited.until and state.hosts.condition_of(host) is HostCondition.UP:
+            awaited.note(now, *REPORT_WAITS)
+            state.send(host, ReportInstances())
 
 
 def _review_forged_batches(state: MasterState, now: float) -> None:
@@ -144,4 +152,4 @@ def _review_forged_batches(state: MasterState, now: float) -> None:
         if now - began >= max(_PATIENCE, _READINGS_LATE * float(table.period[column])):
             del since[column]
             table.status_sequence[column] = table.reported[column]
-            state.send(table.hosts[column], ReportInstances())
+            state.ask_for_report(table.hosts[column], now)

@@ -20,7 +20,6 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.orders import ReportInstances
 
 #: Number of its report periods for which a host may be silent before it is suspect.
 _REPORTS_MISSED: Final = 3
@@ -99,5 +98,5 @@ def mark_up(state: MasterState, host: Host, now: float) -> None:
     if was_lost:
         loss.mark_rejoined(state, host, now)
         state.hosts.set_report_due(host, report_due=True)
-        state.send(host, ReportInstances())
+        state.ask_for_report(host, now)
     reconsider_set_aside(state, now)

@@ -26,7 +26,6 @@ from rosrm.core.master.state.process import DesiredState, Instance, Process, Pro
 from rosrm.model.codec import to_plain
 from rosrm.model.description_checks import description_fault
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.orders import ReportInstances
 from rosrm.model.plan import Execute
 from rosrm.model.records import Intent
 from rosrm.model.values import HostDescription, InstanceStatus, is_plausible
@@ -56,6 +55,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     state.link_queries.begin(host.name, now)
     host.failing.clear()  # the slave reports the plugins that fail in this run
     state.ahead_since.pop(host.column, None)
+    state.note_report(host)
     state.rebalancing.joined_at = now
     if is_new:
         save_host(state, host)
@@ -149,7 +149,7 @@ def _registered_again(
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
         mark_up(state, host, now)
     if condition is not HostCondition.LOST:
-        state.send(host, ReportInstances())
+        state.ask_for_report(host, now)
     state.emit(Reply(event.request, host_id=host.host_id))
 
 
@@ -259,7 +259,7 @@ def _undo_departure(state: MasterState, host: Host, now: float) -> None:
             process.wanted = DesiredState.RUN
             state.save(process)
     loss.mark_rejoined(state, host, now)
-    state.send(host, ReportInstances())
+    state.ask_for_report(host, now)
     reconsider_set_aside(state, now)
 
 

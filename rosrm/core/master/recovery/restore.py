@@ -24,6 +24,7 @@ from rosrm.core.master.state.process import (
     Image,
     LeftBehind,
     PendingAmendment,
+    PendingRestart,
     Process,
     ProcessPhase,
 )
@@ -147,6 +148,10 @@ def _restore_instances(
         else:
             adopt_to_stop(state, instance, spec, host, now)
     process.owner = item["owner"] if item["owner"] in process.instances else 0
+    restart = item.get("restart")  # absent in older journals
+    if process.owner and restart:
+        known = fields_from_plain(PendingRestart, restart, processes.JOURNALED_RESTART)
+        state.instances[process.owner].restarting = PendingRestart(**known)
 
 
 def _has_run(state: MasterState, process: Process, now: float) -> bool:

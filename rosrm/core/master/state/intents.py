@@ -14,8 +14,14 @@ from rosrm.core.master.state.applications import (
 )
 from rosrm.core.master.state.migration import Migration, migration_to_dict
 from rosrm.core.master.state.modes import Modes, mode_to_dict, modes_to_dict
-from rosrm.core.master.state.process import JOURNALED, Instance, PendingAmendment, Process
-from rosrm.model.codec import to_plain
+from rosrm.core.master.state.process import (
+    JOURNALED,
+    JOURNALED_RESTART,
+    Instance,
+    PendingAmendment,
+    Process,
+)
+from rosrm.model.codec import fields_to_plain, to_plain
 from rosrm.model.modes import Mode
 from rosrm.model.records import Intent
 
@@ -68,6 +74,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
     """Return the desired state of a process with its instances and its standby."""
     instances = [(str(number), tables.instances[number]) for number in process.instances]
     owner, left = tables.instances.get(process.owner), process.left_behind
+    restart = owner and owner.restarting
     phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
     standby, pending = tables.standbys.get(process.name), tables.unamended.get(process.name)
     return Intent(
@@ -86,6 +93,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
             },
             "standby": standby and migration_to_dict(standby, ()),
             "left_behind": left and to_plain(left),
+            "restart": restart and fields_to_plain(restart, JOURNALED_RESTART),
             "image": process.image and to_plain(process.image),
             **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
             "ran_before": process.ran_before_owner(owner),

@@ -73,11 +73,10 @@ class InstanceAmendment:
 
 
 @dataclass(frozen=True, slots=True)
-class DependencyRestart:
-    """The order restarts the instance of a process, because a dependency was restarted."""
+class Restart:
+    """The order restarts an instance in place."""
 
-    process: str
-    number: int
+    instance: InstanceId
 
 
 Purpose = (
@@ -89,7 +88,7 @@ Purpose = (
     | PeriodicCheckpoint
     | LinkMeasurement
     | Reload
-    | DependencyRestart
+    | Restart
 )
 
 #: Purposes with their own series of numbers, because they depend on optional plugins or are

@@ -9,6 +9,7 @@ from math import inf, isinf
 from typing import Any, Final
 
 from rosrm.core.master.graph_names import node_of
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
@@ -70,6 +71,27 @@ class DesiredState(str, Enum):
 
 
 @dataclass(slots=True)
+class PendingRestart:
+    """Restart of an instance in place that no status shows yet.
+
+    Attributes:
+        pid, restarts: the run that is to end.
+        follows: a dependency was restarted; False: a client has requested the restart.
+        ordered_at: time of the first order; -inf: a former master gave it.
+    """
+
+    pid: int
+    restarts: int
+    follows: bool
+    ordered_at: float = -inf
+    backoff: Backoff = field(default_factory=Backoff)
+
+
+#: Fields of a pending restart that are journaled.
+JOURNALED_RESTART: Final = ("pid", "restarts", "follows")
+
+
+@dataclass(slots=True)
 class Instance:
     """One start of a process on one host, as the master sees it.
 
@@ -84,7 +106,7 @@ class Instance:
         seen: newest usage in base units; also of resources that are not attributed, if measured.
         peak: highest usage in base units.
         message: text of its slave's newest report, e.g. how its program ended.
-        restarting: the slave was ordered to restart it, and no report shows the restart yet.
+        restarting: restart that was ordered and that no status shows yet; None: there is none.
         settled: its estimates no longer count.
         shown: the readings show its load of shared resources, which no longer counts.
         redelivered: the assignment was delivered again, because its slave did not accept it.
@@ -114,7 +136,7 @@ class Instance:
     seen: dict[str, float] = field(default_factory=dict)
     peak: dict[str, float] = field(default_factory=dict)
     stopping: bool = False
-    restarting: bool = False
+    restarting: PendingRestart | None = None
     settled: bool = False
     shown: bool = False
     redelivered: bool = False

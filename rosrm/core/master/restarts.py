@@ -1,0 +1,131 @@
+"""Restarts in place: each order is repeated while the run is there for which it was meant.
+
+=================================  =============================================================
+observed                           action
+=================================  =============================================================
+a client, or the restart of a      `RestartInstance`; the run of the owner (pid, restarts) is
+dependency, restarts a process     journaled with the process
+another run is reported            the restart is done
+the same run is still reported     `RestartInstance` again, with back-off, while the host is up and
+                                   no status of it is missing
+the run has ended before           the process is queued again
+the slave refuses the order, or    the restart is given up, which is recorded; that by a dependency
+its host is lost                   stays due until the host returns
+another instance owns the name     the restart has no object any more
+=================================  =============================================================
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from rosrm.core.master import events as happened
+from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.hosts import HostCondition
+from rosrm.core.master.state.pending_orders import Restart
+from rosrm.core.master.state.process import DesiredState, Instance, PendingRestart, Process
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.orders import RestartInstance
+from rosrm.model.values import InstanceState, InstanceStatus
+
+#: Reported states that show that the slave has begun to restart the instance.
+_RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
+#: Conditions of a host on which a restart is given up.
+_GONE: Final = frozenset({HostCondition.LOST, HostCondition.DETACHED})
+#: Longest time, in seconds, between two orders.
+_LONGEST_WAIT: Final = 60.0
+#: Readings of a host, after which a lost status batch is known to be missing.
+_READINGS: Final = 3
+
+
+def begin(
+    state: MasterState, process: Process, owner: Instance, now: float, *, follows: bool = False
+) -> None:
+    """Order the restart of the owner of a process; `follows`: a dependency was restarted."""
+    owner.restarting = PendingRestart(owner.pid, owner.restarts, follows, now)
+    _order(state, owner, owner.restarting, now)
+    state.save(process)
+
+
+def _order(state: MasterState, owner: Instance, pending: PendingRestart, now: float) -> None:
+    period = float(state.hosts.period[owner.host.column])
+    pending.backoff.note(now, max(state.settings.order_retry, _READINGS * period), _LONGEST_WAIT)
+    state.send(owner.host, RestartInstance(owner.id), Restart(owner.id))
+
+
+def review(state: MasterState, instance: Instance, now: float) -> None:
+    """Repeat an order that has had no effect; give one up that cannot have any."""
+    pending, process = instance.restarting, state.owned_by(instance)
+    if pending is None:
+        return
+    if process is None or process.wanted is not DesiredState.RUN:
+        _end(state, instance)
+    elif (condition := state.hosts.condition_of(instance.host)) in _GONE:
+        _give_up(state, process, instance, f"{instance.host.name} {condition.words()}", now)
+    elif now >= pending.backoff.until and _may_be_ordered(state, instance):
+        _order(state, instance, pending, now)
+
+
+def _may_be_ordered(state: MasterState, owner: Instance) -> bool:
+    """Return True if the newest status of the owner is known, so that it is not restarted twice."""
+    column = owner.host.column
+    if owner.id.process in state.migrations or column in state.reports_awaited:
+        return False
+    is_up = state.hosts.condition_of(owner.host) is HostCondition.UP
+    return is_up and column not in state.hosts.statuses_missing()
+
+
+def note_status(state: MasterState, instance: Instance, status: InstanceStatus) -> None:
+    """End a pending restart if a status shows another run than the one for which it was meant."""
+    pending = instance.restarting
+    if pending is None:
+        return
+    other_pid = status.pid and status.pid != pending.pid
+    if status.state in _RESTARTS or other_pid or status.restarts != pending.restarts:
+        _end(state, instance)
+
+
+def was_missed(instance: Instance, status: InstanceStatus, now: float) -> bool:
+    """Return True if an ended run is older than the pending order to restart it.
+
+    The statuses of a restart may be lost, so the end of a later run may be the first that arrives.
+    """
+    pending = instance.restarting
+    return pending is not None and status.run_time >= now - pending.ordered_at
+
+
+def note_answer(
+    state: MasterState, purpose: Restart, event: happened.OrderAnswered, now: float
+) -> None:
+    """Give a refused restart up; repeat the first order at once if it has no answer."""
+    instance = state.instances.get(purpose.instance.number)
+    process = state.owned_by(instance) if instance is not None else None
+    if instance is None or process is None or instance.restarting is None:
+        return
+    backoff = instance.restarting.backoff
+    if event.outcome is OrderOutcome.TIMEOUT and backoff.tries == 1:
+        backoff.until = now
+        review(state, instance, now)
+    elif event.outcome is not OrderOutcome.TIMEOUT and not event.accepted:
+        _give_up(state, process, instance, event.reason, now, again=False)
+
+
+def _end(state: MasterState, instance: Instance) -> None:
+    instance.restarting = None
+    process = state.processes.get(instance.id.process)
+    if process is not None:
+        state.save(process)
+
+
+def _give_up(
+    state: MasterState, process: Process, instance: Instance, why: str, now: float,
+    *, again: bool = True,
+) -> None:  # fmt: skip
+    """Give a restart up; `again`: one by a dependency is due again when the host returns."""
+    process.restart_due = again and instance.restarting is not None and instance.restarting.follows
+    state.record(
+        now, EventKind.RESTART_REFUSED, f"{process.name} was not restarted: {why}",
+        process=process.name, host=instance.host.name,
+    )  # fmt: skip
+    _end(state, instance)

@@ -1,0 +1,185 @@
+"""Restarts in place: a lost order is repeated, and only restarts the run for which it was meant."""
+
+from __future__ import annotations
+
+import pytest
+
+from rosrm.core.master import events as happened
+from rosrm.core.slave import events
+from rosrm.model.orders import ReportInstances, RestartInstance
+from rosrm.model.values import InstanceState, InstanceStatus, RestartPolicy
+from tests.unit.core.cluster import Cluster, job, process
+from tests.unit.core.test_start_order import follower
+
+
+def runs(cluster: Cluster, name: str = "p", host: str = "a") -> int:
+    """Return the number of restarts of a process that really were carried out."""
+    machine = cluster.machines[host]
+    return machine.programs[machine.find(name)].run
+
+
+def lose_orders(cluster: Cluster, host: str = "a") -> None:
+    """Lose the orders on their way to a host, and those that are given at once in their place."""
+    machine = cluster.machines[host]
+    for _ in range(3):
+        while machine.ordered:
+            cluster.tell(happened.OrderAnswered.missing(machine.ordered.popleft().order_id))
+
+
+def restart_unreported(cluster: Cluster) -> None:
+    """Restart a process, and lose the answer of the slave and the statuses of the restart."""
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    machine = cluster.machines["a"]
+    machine.obey(machine.ordered.popleft(), cluster.now)
+    machine.status_batches.clear()
+
+
+def forget_order(cluster: Cluster) -> None:
+    """Let a slave accept an order to restart, and be killed before its supervisor gets it."""
+    machine = cluster.machines["a"]
+    (sent,) = [one for one in machine.ordered if isinstance(one.order, RestartInstance)]
+    machine.ordered.clear()
+    cluster.tell(happened.OrderAnswered(sent.order_id, accepted=True))
+    cluster.cut("a", seconds=2.0)
+    cluster.restart_slave("a")
+
+
+def test_a_restart_order_without_an_answer_is_repeated_until_the_run_has_changed() -> None:
+    """The process is restarted once."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    lose_orders(cluster)
+    assert runs(cluster) == 0
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+    assert cluster.state.instances[cluster["p"].owner].restarting is None
+
+
+def test_a_lost_report_of_a_restart_does_not_cause_another_restart() -> None:
+    """The master asks for the missing report before it repeats the order."""
+    cluster = Cluster("a").with_processes(process("p"))
+    restart_unreported(cluster)
+    cluster.wait(0.2)
+    cluster.tell(happened.OrderAnswered.missing(cluster.sent(RestartInstance)[0].order_id))
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+    assert cluster.state.instances[cluster["p"].owner].restarting is None
+
+
+def test_an_accepted_restart_that_the_slave_forgets_is_ordered_again() -> None:
+    """The slave was killed before it gave the order to its supervisor."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    forget_order(cluster)
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+
+
+def test_a_requested_restart_survives_a_restart_of_the_master() -> None:
+    """The run for which it was meant is journaled."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    cluster.restart_master()
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+
+
+def test_a_restart_that_was_carried_out_is_not_repeated_by_the_next_master() -> None:
+    """The next master sees another run than the one in the journal."""
+    cluster = Cluster("a").with_processes(process("p"))
+    restart_unreported(cluster)
+    cluster.restart_master()
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+
+
+def test_a_run_that_its_policy_started_anew_is_not_restarted_by_an_older_order() -> None:
+    """The order was meant for the run that has crashed."""
+    cluster = Cluster("a").with_processes(process("p", restart=RestartPolicy("always")))
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    cluster.machines["a"].ordered.clear()
+    cluster.finish("p", code=1)
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+
+
+@pytest.mark.parametrize("run_time", [1.0, 3600.0])
+def test_a_job_whose_restart_was_not_reported_finishes_once(run_time: float) -> None:
+    """The statuses of the restart are lost: only a run longer than the time since is older."""
+    cluster = Cluster("a").with_processes(job("p"))
+    instance = cluster.state.instances[cluster["p"].owner].id
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    cluster.cut("a", seconds=5.0)
+    end = InstanceStatus(instance, InstanceState.EXITED, run_time=run_time)
+    machine = cluster.machines["a"]
+    machine.batches += 3
+    machine.connected = True
+    cluster.report("a", end)
+    assert (cluster.phase("p") == "finished") is (run_time < 5.0)
+
+
+def test_a_restart_is_given_up_with_a_record_when_the_host_is_lost() -> None:
+    """A host that returns much later does not restart the process."""
+    cluster = Cluster("a", "b", lease=5.0).with_processes(process("p"))
+    (host,) = cluster.where("p")
+    cluster.machines[host].connected = False
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    cluster.machines[host].ordered.clear()
+    cluster.wait(10.0)
+    assert cluster.recorded("restart_refused") == [f"p was not restarted: {host} is lost"]
+    cluster.reconnect(host, seconds=60.0)
+    assert runs(cluster, host=host) == 0
+
+
+def test_a_refused_restart_is_recorded_and_not_repeated() -> None:
+    """The record has the reason of the slave."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    (sent,) = cluster.machines["a"].ordered
+    cluster.machines["a"].ordered.clear()
+    cluster.tell(happened.OrderAnswered(sent.order_id, accepted=False, message="it shuts down"))
+    cluster.wait(60.0)
+    assert cluster.recorded("restart_refused") == ["p was not restarted: it shuts down"]
+    assert runs(cluster) == 0
+
+
+def test_a_dependant_is_restarted_although_its_slave_forgets_the_accepted_order() -> None:
+    """The restart stays due until a status shows it."""
+    cluster = Cluster("a").with_processes(process("camera"), follower("p", "camera"))
+    cluster.ask(happened.RestartRequested, ("camera",), settle=False)
+    machine = cluster.machines["a"]
+    cluster.tell(machine.obey(machine.ordered.popleft(), cluster.now))
+    while machine.status_batches:
+        cluster.tell(machine.status_batches.popleft())
+    forget_order(cluster)
+    cluster.wait(60.0)
+    assert runs(cluster) == 1
+
+
+def test_the_report_after_a_gap_of_the_statuses_is_asked_for_until_it_arrives() -> None:
+    """The order may be lost, too; the readings no longer show the gap."""
+    cluster = Cluster("a").with_processes(process("p"), process("q"))
+    machine = cluster.machines["a"]
+    machine._end(machine.find("p"), InstanceState.FAILED, cluster.now, code=3)
+    machine.status_batches.clear()
+    machine._end(machine.find("q"), InstanceState.FAILED, cluster.now, code=3)
+    cluster.tell(machine.status_batches.popleft())
+    assert cluster.state.reports_awaited
+    lose_orders(cluster)
+    cluster.wait(5.0)
+    assert (cluster.phase("p"), cluster.phase("q")) == ("failed", "failed")
+    assert not cluster.state.reports_awaited
+
+
+def test_the_order_to_report_is_repeated_with_back_off() -> None:
+    """A slave that never reports gets fewer and fewer orders."""
+    cluster = Cluster("a").with_processes(process("p"))
+    machine = cluster.machines["a"]
+    machine.tell(events.ReportRequested(), cluster.now)
+    machine.status_batches.clear()
+    for _ in range(600):
+        cluster.now += 0.1
+        cluster.read()
+        cluster.tell(happened.TimePassed())
+        machine.ordered.clear()
+    assert 4 <= len(cluster.orders(ReportInstances)) <= 10
