@@ -404,6 +404,7 @@ class MasterState:
         process.spec, process.plain, process.node = spec, Plain(spec), node_of(spec)
         self.ledger.put(process.principal, process_key(process.name), size_of(spec))
         process.demand, process.awaits_gang = None, awaits_gang
+        process.moves.clear()
         self.wants_standby.pop(process.name, None)
         self.time_limited.pop(process.name, None)
         self.scheduled.pop(process.name, None)

@@ -412,7 +412,7 @@ def migration_requested(state: MasterState, event: happened.MigrationRequested, 
     (process,) = known_processes(state, [event.name], event.by)
     host = None if event.host is None else known_host(state, event.host)
     check_rights(running_with(state, process), event.by)
-    rejected = try_move(state, process, _cause(event.by), now, host=host)
+    rejected = try_move(state, process, _cause(event.by), now, host=host, asked=True)
     if rejected is not None:
         _note_refused_move(state, process, rejected.reason, now)
         raise RequestRefused(rejected.reason)

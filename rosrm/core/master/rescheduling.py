@@ -53,6 +53,7 @@ def forget_failures(process: Process) -> None:
 def allow_every_host(process: Process) -> None:
     """Let a process start on the hosts again that have refused it or on which it failed."""
     process.excluded.clear()
+    process.moves.clear()
     forget_failures(process)
 
 

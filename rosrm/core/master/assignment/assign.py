@@ -52,16 +52,16 @@ _FIRST_REQUEST: Final = 1.0
 
 def demand_to_move(
     state: MasterState, process: Process, seen: Mapping[str, float], source: str, headroom: float,
-    lacking: Mapping[str, str] = EMPTY, *, together: AbstractSet[str] = frozenset(),
+    avoided: Mapping[str, str] = EMPTY, *, together: AbstractSet[str] = frozenset(),
 ) -> Demand:  # fmt: skip
     """Return the demand of a running process at the destination of its migration.
 
     Args:
-        lacking: hosts without a needed executor, each with the reason.
+        avoided: further hosts that must not be chosen, each with the reason.
         together: names of the processes that move with it to the same host.
     """
     excluded = {
-        **process.forbidden_hosts, **unable(state, process, source), **lacking,
+        **process.forbidden_hosts, **unable(state, process, source), **avoided,
         source: "it is the source of the move",
     }  # fmt: skip
     amounts, guessed = demand_amounts(state, process, measured_need(state, seen))

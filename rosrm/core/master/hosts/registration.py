@@ -164,6 +164,7 @@ def _clear_exclusions(state: MasterState, host: Host) -> None:
         if process.phase is ProcessPhase.CANCELLED and process.ended_on == host.name:
             process.reason = ""
     for process in state.processes.values():
+        process.moves.forget(host.name)
         if (process.excluded or process.failed_on) and not process.phase.is_terminal:
             _clear_exclusion(process, host)
 

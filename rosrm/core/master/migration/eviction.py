@@ -191,17 +191,18 @@ def _why_not_now(
 
 def try_move(
     state: MasterState, process: Process, cause: str, now: float, *, headroom: float = 0.0,
-    host: Host | None = None,
+    host: Host | None = None, asked: bool = False,
 ) -> Rejected | None:  # fmt: skip
     """Move a process to the host with the largest margin, or to a given one.
 
     The processes that must stay on one host with it move along. A host that lacks an executor of a
-    plan is skipped, unless it was given.
+    plan is skipped, unless it was given; and so is one to which a move has failed, for a time that
+    doubles with each failure, unless a user has `asked` for the move.
 
     Returns:
         None; or the reason why the process cannot be moved, and nothing has changed.
     """
-    planned = plan_moves(state, process, cause, now, headroom=headroom, host=host)
+    planned = plan_moves(state, process, cause, now, headroom=headroom, host=host, asked=asked)
     if isinstance(planned, Rejected):
         return planned
     begin_moves(state, planned, now)
@@ -230,16 +231,19 @@ def begin_moves(state: MasterState, planned: PlannedMoves, now: float) -> None:
 
 def plan_moves(
     state: MasterState, process: Process, cause: str, now: float, *, headroom: float = 0.0,
-    host: Host | None = None,
+    host: Host | None = None, asked: bool = False,
 ) -> PlannedMoves | Rejected:  # fmt: skip
     """Plan the move of a process as `try_move` does; return the reason if it cannot be moved."""
     moving = [process, *running_with(state, process)]
     refusal = why_immovable(state, process) or _why_bound(state, moving)
+    if not asked:
+        refusal = refusal or next(filter(None, (_why_too_soon(one, now) for one in moving)), "")
     if refusal:
         return Rejected(refusal)
     source, lacking = state.instances[process.owner].host, dict[str, str]()
+    failed = {} if asked else _failed_destinations(moving, now)
     while True:
-        rankings = _rankings_to_move(state, moving, headroom, lacking)
+        rankings = _rankings_to_move(state, moving, headroom, {**failed, **lacking})
         ranking = _joint_ranking(state, rankings)
         destination = _destination(state, process, ranking, source, host)
         if isinstance(destination, Rejected):
@@ -260,6 +264,16 @@ def plan_moves(
         for one, migration in zip(moving, migrations, strict=True)
     ]
     return PlannedMoves(destination, tuple(steps))
+
+
+def _why_too_soon(process: Process, now: float) -> str:
+    """Return why a process must not be moved so soon after a failed move; "": it may."""
+    why = process.moves.why_none(now)
+    return f"{process.name} is not moved again yet: {why}" if why else ""
+
+
+def _failed_destinations(moving: Sequence[Process], now: float) -> dict[str, str]:
+    return {host: why for one in moving for host, why in one.moves.waiting(now).items()}
 
 
 def hosts_to_move_to(state: MasterState, process: Process) -> list[str]:
@@ -295,7 +309,7 @@ def _why_bound(state: MasterState, moving: Sequence[Process]) -> str:
 
 
 def _rankings_to_move(
-    state: MasterState, moving: Sequence[Process], headroom: float, lacking: Mapping[str, str]
+    state: MasterState, moving: Sequence[Process], headroom: float, avoided: Mapping[str, str]
 ) -> dict[str, Ranking]:
     """Return the ranking of each process, as if the others had moved already."""
     names = {one.name for one in moving}
@@ -303,7 +317,7 @@ def _rankings_to_move(
     for one in moving:
         source = state.instances[one.owner]
         demand = demand_to_move(
-            state, one, source.measured, source.host.name, headroom, lacking, together=names
+            state, one, source.measured, source.host.name, headroom, avoided, together=names
         )
         rankings[one.name] = ranking_of(state, demand)
     return rankings
@@ -365,7 +379,7 @@ def _why_nowhere(state: MasterState, process: Process, ranking: Ranking, source:
 
 def departures(state: MasterState, host: Host, now: float) -> str:
     """Return phrases on the processes that leave a draining host, that wait for it, and cannot."""
-    names, staying = _leaving(state, host), _staying(state, host)
+    names, staying = _leaving(state, host, now), _staying(state, host, now)
     if not names:
         return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
     waits = {name: why for name in names if (why := _why_not_yet(state, name, now))}
@@ -391,16 +405,17 @@ def _why_not_yet(state: MasterState, name: str, now: float) -> str:
     return planned.reason if isinstance(planned, Rejected) else ""
 
 
-def _leaving(state: MasterState, host: Host) -> list[str]:
+def _leaving(state: MasterState, host: Host, now: float) -> list[str]:
     """Return the processes whose instances on a host will move away or end."""
     held = state.instances_of(host)
-    return sorted({one.id.process for one in held if not _why_it_stays(state, one)})
+    return sorted({one.id.process for one in held if not _why_it_stays(state, one, now)})
 
 
-def _staying(state: MasterState, host: Host) -> list[str]:
+def _staying(state: MasterState, host: Host, now: float) -> list[str]:
     """Return the reasons why processes cannot leave a host, each reason once."""
     held = state.instances_of(host)
-    reasons = [(one.id.process, reason) for one in held if (reason := _why_it_stays(state, one))]
+    found = [(one.id.process, _why_it_stays(state, one, now)) for one in held]
+    reasons = [(name, reason) for name, reason in found if reason]
     return _grouped(reasons + _images_on(state, host))
 
 
@@ -417,8 +432,11 @@ def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
     return [f"{each_of(alike)} {text}" if named else text for (text, named), alike in names.items()]
 
 
-def _why_it_stays(state: MasterState, instance: Instance) -> str:
-    """Return why an instance stays on its host; "" if it can move or is about to end."""
+def _why_it_stays(state: MasterState, instance: Instance, now: float) -> str:
+    """Return why an instance stays on its host; "" if it can move or is about to end.
+
+    It also stays while its moves to all other hosts have failed, until one is tried again.
+    """
     process, source = state.owned_by(instance), instance.host
     if process is None or process.wanted is not DesiredState.RUN:
         return ""
@@ -429,7 +447,8 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
         return reason
     # Only labels, resources and exclusions count here. A missing capability, or a lost host, may
     # change later.
-    lasting = {**process.forbidden_hosts, source.name: "it is there"}
+    failed = process.moves.waiting(now)
+    lasting = {**process.forbidden_hosts, **failed, source.name: "it is there"}
     measured = measured_need(state, instance.measured)
     amounts, estimated = demand_amounts(state, process, measured)
     demand = Demand(process.spec, amounts, estimated, lasting, plugins=state.placement)
@@ -440,20 +459,22 @@ def _why_it_stays(state: MasterState, instance: Instance) -> str:
         return _ALONE
     others = [host.column for host in state.hosts.listed() if host is not source]
     why = by_reason(why_each_never(state.hosts, demand, others[:_MOST_HOSTS]))
-    return f"{process.name} may run on no other host: {why}"
+    again = "; the move is tried again later" if failed else ""
+    return f"{process.name} may run on no other host: {why}{again}"
 
 
 def _note_drained(state: MasterState, host: Host, now: float) -> None:
     """Record once that a host is drained: every process left on it cannot leave."""
     if state.hosts.why_unreachable(host):
         return
-    held, before = state.instances_of(host), host.drained
-    host.drained = all(_why_it_stays(state, one) for one in held)
-    if host.drained and not before:
-        state.record(
-            now, EventKind.HOST_DRAINED, f"{host.name} is drained: {departures(state, host, now)}",
-            host=host.name,
-        )  # fmt: skip
+    host.drained = all(_why_it_stays(state, one, now) for one in state.instances_of(host))
+    if not host.drained:
+        return
+    left = departures(state, host, now)
+    if host.blocked.get("drained") != left:  # what is left may try to leave again
+        host.blocked["drained"] = left
+        message = f"{host.name} is drained: {left}"
+        state.record(now, EventKind.HOST_DRAINED, message, host=host.name)
 
 
 def _drain(state: MasterState, host: Host, now: float) -> None:

@@ -338,9 +338,22 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
             **({} if silent is None else {"blackout": silent}),
         },
     )  # fmt: skip
+    _note_try(state, process, migration, now)
     if kind is EventKind.STAYED and process.decision and process.decision["kind"] == "migrated":
         process.decision = {**process.decision, "kind": kind}
     _settle_owner(state, process, migration, now)
+
+
+def _note_try(state: MasterState, process: Process, migration: Migration, now: float) -> None:
+    """Remember a failed move of a process, which the master must not repeat at once."""
+    there = migration.destination_host.name
+    if migration.aim is not Aim.MOVE or migration.spec is not None:
+        return
+    if migration.undo is None:
+        process.moves.forget(there)
+    elif process.wanted is DesiredState.RUN:
+        why = f"its move to {there} has failed: {migration.failure}"
+        process.moves.note(there, why, now, state.settings.cooldown)
 
 
 def _note_not_replaced(state: MasterState, process: Process, migration: Migration) -> None:

@@ -18,6 +18,8 @@ has ended               the standby is stopped
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from math import inf
 from typing import Final
 
 from rosrm.core.master import lifecycle
@@ -32,8 +34,10 @@ from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Start
+from rosrm.model.values import EMPTY
 
-#: Seconds between a failed standby and the next one; doubled with each failure.
+#: Seconds between a lost standby and the next one; doubled with each one, unless it was ready for
+#: the longest time.
 _FIRST_WAIT: Final = 2.0
 _LONGEST_WAIT: Final = 60.0
 #: Highest number of standbys that one review starts.
@@ -54,7 +58,7 @@ def review_standbys(state: MasterState, now: float) -> None:
 def _lacks_one(state: MasterState, process: Process, now: float) -> bool:
     alone = process.name not in state.standbys and process.name not in state.migrations
     calm = process.phase is ProcessPhase.RUNNING and process.wanted is DesiredState.RUN
-    return alone and calm and len(process.instances) == 1 and now >= process.standby_at
+    return alone and calm and len(process.instances) == 1 and now >= process.standby_backoff.until
 
 
 # --- start of a standby -----------------------------------------------------------------------
@@ -62,7 +66,9 @@ def _lacks_one(state: MasterState, process: Process, now: float) -> bool:
 
 def _begin(state: MasterState, process: Process, now: float) -> bool:
     owner = state.instances[process.owner]
-    ranking = ranking_of(state, _demand(state, process, owner.host))
+    ranking = ranking_of(state, _demand(state, process, owner.host, process.moves.waiting(now)))
+    if ranking.best() < 0:  # rather a host where a standby has failed than no standby
+        ranking = ranking_of(state, _demand(state, process, owner.host, EMPTY))
     column = ranking.best()
     if column < 0:
         _wait(state, process, "no host has room for its standby", now)
@@ -97,13 +103,20 @@ def _can_wait(migration: Migration) -> bool:
     )
 
 
-def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
+def _demand(
+    state: MasterState, process: Process, primary: Host, failed: Mapping[str, str]
+) -> Demand:
     """Return the demand of a standby: that of the process, without hosts too near the primary.
+
+    `failed`: further hosts that must not be chosen, each with the reason.
 
     A standby need not run near the neighbours of the process, but must run apart from others.
     """
     own = demand_of(state, process)
-    excluded = {**process.forbidden_hosts, primary.name: "the primary runs there"}
+    excluded = {
+        **process.forbidden_hosts, **failed,
+        primary.name: "the primary runs there",
+    }  # fmt: skip
     labels = primary.description.labels
     spread = [rule.by for rule in process.spec.neighbours if rule.group and not rule.prefer]
     apart_by = dict.fromkeys((*process.spec.standby.apart_by, *filter(None, spread)))
@@ -127,7 +140,7 @@ def _demand(state: MasterState, process: Process, primary: Host) -> Demand:
 
 def _wait(state: MasterState, process: Process, why: str, now: float) -> None:
     """Delay the next standby; record the reason once."""
-    process.standby_at = now + _FIRST_WAIT
+    process.standby_backoff.until = now + _FIRST_WAIT
     if process.standby_reason != why:
         process.standby_reason = why
         state.record(now, EventKind.STANDBY_WAITS, f"{process.name}: {why}", process=process.name)
@@ -147,7 +160,7 @@ def _review(state: MasterState, migration: Migration, now: float) -> None:
         return
     elif instance is None:
         how = migration.how_ended(migration.destination)
-        _lost(state, process, migration, f"{migration.destination} ended: {how}", now)
+        _failed(state, process, migration, f"{migration.destination} ended: {how}", now)
     elif process.owner != migration.source.number:
         _end(state, process, now)
     elif instance.host.draining:
@@ -155,7 +168,7 @@ def _review(state: MasterState, migration: Migration, now: float) -> None:
     elif migration.source_restarted:
         _lost(state, process, migration, f"{migration.source} was restarted", now)
     elif (gave_up := _why_given_up(migration)) is not None:
-        _lost(state, process, migration, gave_up, now)
+        _failed(state, process, migration, gave_up, now)
     else:
         _advance(state, process, migration, now)
 
@@ -174,7 +187,7 @@ def _advance(state: MasterState, process: Process, migration: Migration, now: fl
     if isinstance(outcome, StepFailed):
         late = f"{migration.destination} did not start in time"
         why = late if outcome.timed_out else outcome.reason
-        _lost(state, process, migration, why, now)
+        _failed(state, process, migration, why, now)
     elif outcome is StepProgress.DONE:
         _note_ready(state, process, migration, now)
     elif isinstance(migration.current_step, Configure):
@@ -186,17 +199,27 @@ def _note_ready(state: MasterState, process: Process, migration: Migration, now:
     host = migration.destination_host.name
     ready = f"its standby is ready on {host}"
     if process.standby_reason != ready:
-        process.standby_reason, process.standby_tries = ready, 0
+        process.standby_reason, process.standby_since = ready, now
         state.record(
             now, EventKind.STANDBY_READY, f"the standby of {process.name} is ready on {host}",
             process=process.name, host=host,
         )  # fmt: skip
 
 
+def _failed(
+    state: MasterState, process: Process, migration: Migration, why: str, now: float
+) -> None:
+    """Replace a standby that has failed, if possible on another host."""
+    host = migration.destination_host.name
+    process.moves.note(host, f"its standby there has failed: {why}", now, _LONGEST_WAIT)
+    _lost(state, process, migration, why, now)
+
+
 def _lost(state: MasterState, process: Process, migration: Migration, why: str, now: float) -> None:
-    wait = min(_FIRST_WAIT * 2.0**process.standby_tries, _LONGEST_WAIT)
-    process.standby_tries = min(process.standby_tries + 1, 16)
-    process.standby_at = now + wait
+    if now - process.standby_since >= _LONGEST_WAIT:
+        process.standby_backoff.tries = 0
+    process.standby_since = inf
+    wait = process.standby_backoff.note(now, _FIRST_WAIT, _LONGEST_WAIT)
     state.record(
         now, EventKind.STANDBY_LOST,
         f"{process.name} has no standby: {why}; the master starts another one in {wait:g} s",

@@ -30,3 +30,45 @@ class Backoff:
         wait = min(first * 2.0**self.tries, max(first, longest))
         self.tries, self.until = min(self.tries + 1, _MOST), now + wait
         return wait
+
+
+class Retries:
+    """Memory of failed tries by what was tried, such as the destination of a move.
+
+    Two waits follow a failure: one until the same is tried again, and a shorter one until anything
+    is tried. Both double with each failure in a row.
+    """
+
+    #: Wait, in seconds, after the first failure, and the longest one.
+    FIRST: Final = 2.0
+    LONGEST: Final = 600.0
+
+    def __init__(self) -> None:
+        self._of: dict[str, tuple[str, Backoff]] = {}
+        self._all = Backoff()
+        self._newest = ""
+
+    def note(self, what: str, why: str, now: float, first: float) -> None:
+        """Note why a try has failed; `first`: seconds until the same may be tried again."""
+        _, backoff = self._of.get(what, ("", Backoff()))
+        backoff.note(now, max(first, self.FIRST), self.LONGEST)
+        self._all.note(now, self.FIRST, self.LONGEST)
+        self._of[what], self._newest = (why, backoff), why
+
+    def why_none(self, now: float) -> str:
+        """Return the newest failure if nothing may be tried yet; "": something may."""
+        return self._newest if now < self._all.until else ""
+
+    def waiting(self, now: float) -> dict[str, str]:
+        """Return what may not be tried again yet, each with its failure."""
+        return {what: why for what, (why, backoff) in self._of.items() if now < backoff.until}
+
+    def forget(self, what: str) -> None:
+        """Forget the failures of one thing, because it has changed or has succeeded."""
+        if self._of.pop(what, None) is not None:
+            self._all = Backoff()
+
+    def clear(self) -> None:
+        """Forget all failures."""
+        self._of.clear()
+        self._all = Backoff()

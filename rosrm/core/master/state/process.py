@@ -9,7 +9,7 @@ from math import inf, isinf
 from typing import Any, Final
 
 from rosrm.core.master.graph_names import node_of
-from rosrm.core.master.state.backoff import Backoff
+from rosrm.core.master.state.backoff import Backoff, Retries
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
@@ -272,8 +272,9 @@ class Process:
         left_behind: instance that may still run on a lost host, while this process waits in the
             queue.
         image: checkpoint image from which it can be restored; None: it is not checkpointed.
-        standby_at: time before which no standby is started.
-        standby_tries: number of standbys that were lost in a row.
+        moves: failed moves and standbys, by their hosts.
+        standby_backoff: time before which no standby is started.
+        standby_since: time at which its standby was ready; inf: it is not.
         standby_reason: condition of its standby, for listings.
         started_at: time at which it first started since it left the queue; inf: not yet, or its
             host has not yet reported for how long it has run.
@@ -323,8 +324,9 @@ class Process:
     decided_at: float = 0.0
     left_behind: LeftBehind | None = None
     image: Image | None = None
-    standby_at: float = 0.0
-    standby_tries: int = 0
+    moves: Retries = field(default_factory=Retries)
+    standby_backoff: Backoff = field(default_factory=Backoff)
+    standby_since: float = inf
     standby_reason: str = ""
     started_at: float = inf
     began: float = 0.0
