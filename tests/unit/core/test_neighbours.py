@@ -431,3 +431,88 @@ def test_processes_without_neighbours_have_no_rules_to_read() -> None:
     assert cluster["r"].demand is not None
     assert cluster["r"].demand[1].neighbours == ()
     assert cluster["q"].demand[1].neighbours != ()
+
+
+# --- labels that are not known yet --------------------------------------------------------------
+
+
+def two_in_a_rack(cluster: Cluster) -> tuple[str, str]:
+    """Let `db2` wait for rack 2, apart from `db1`; return the host of `db1`, and the other one."""
+    (on,) = cluster.where("db1")
+    cluster.machines["c"].busy["memory"] = 0.75
+    cluster.read()
+    cluster.submit(process("db2", 300, neighbours=apart("db1", by="rack")))
+    assert cluster.phase("db2") == "queued"
+    return on, {"a": "b", "b": "a"}[on]
+
+
+def test_a_restart_of_the_master_keeps_the_labels_of_a_host_that_reports_late() -> None:
+    """They are in the journal, also while the host is lost."""
+    cluster = cluster_of("abc", process("db1", 300), lease=5.0)
+    on, other = two_in_a_rack(cluster)
+    cluster.machines[on].connected = False
+    cluster.restart_master()
+    cluster.wait(20.0)
+    assert (cluster.phase("db2"), cluster.where("db2")) == ("queued", [])
+    why = "it has rack=1, as the host of db1, apart from which the process must run"
+    assert reasons(cluster, "db2")[other] == why
+
+
+def test_a_changed_label_is_known_after_a_restart_of_the_master() -> None:
+    """The slave has reported another label since it registered first."""
+    cluster = cluster_of("abc", process("db1", 300))
+    on, _ = two_in_a_rack(cluster)
+    cluster.machines[on].labels = {"rack": "7"}
+    cluster.register(cluster.machines[on])
+    cluster.kill_master()
+    assert cluster.state.hosts.by_name[on].description.labels == {"rack": "7"}
+
+
+def test_a_process_waits_until_an_unknown_label_is_reported() -> None:
+    """A journal of an earlier version has no labels. The reason names the host."""
+    cluster = cluster_of("abc", process("db1", 300))
+    on, other = two_in_a_rack(cluster)
+    for desired in cluster.intents["host"].values():
+        del desired["labels"]
+    cluster.machines[on].connected = False
+    cluster.restart_master()
+    cluster.wait(5.0)
+    assert cluster.where("db2") == []
+    why = (
+        f"the label 'rack' of {on}, the host of db1, apart from which the process must run, is not "
+        f"known until it reports"
+    )
+    assert reasons(cluster, "db2")[other] == why
+
+
+def test_a_process_is_not_separated_from_one_on_a_host_with_unknown_labels() -> None:
+    """It is not moved, either."""
+    cluster = cluster_of("abc", process("camera"))
+    (on,) = cluster.where("camera")
+    cluster.set_host(on, "cordon")
+    cluster.submit(movable("viewer", neighbours=near("camera", by="rack")))
+    assert cluster.where("viewer") not in ([on], [])
+    for desired in cluster.intents["host"].values():
+        del desired["labels"]
+    cluster.machines[on].connected = False
+    cluster.restart_master()
+    cluster.wait(30.0)
+    assert not cluster.recorded("separated")
+
+
+def test_a_standby_waits_if_the_host_of_its_primary_has_no_place() -> None:
+    """A missing label is no other value."""
+    cluster = Cluster(*map(machine, "ab"), Machine("x")).with_processes()
+    for name in "ab":
+        cluster.set_host(name, "cordon")
+    cluster.submit(
+        node(
+            "p", migration=MigrationPolicy("handoff"),
+            standby=StandbyPolicy(wanted=True, apart_by=("rack",)),
+        )
+    )  # fmt: skip
+    cluster.discover("p", on="x")
+    for name in "ab":
+        cluster.set_host(name, "uncordon")
+    cluster.wait(5.0)
+    assert cluster.where("p") == ["x"]

@@ -50,14 +50,14 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     taken = _name_taken(state, known, event)
     if taken:
         raise _refusal(state, event, taken, "name_taken", now)
-    is_new = known is None or known.pruned
+    labels = None if known is None or not known.has_labels else known.description.labels
     host = state.hosts.register(description, now)
     state.link_queries.begin(host.name, now)
     host.failing.clear()  # the slave reports the plugins that fail in this run
     state.ahead_since.pop(host.column, None)
     state.note_report(host)
     state.rebalancing.joined_at = now
-    if is_new:
+    if labels != description.labels:
         save_host(state, host)
     state.record(
         now, EventKind.HOST_REGISTERED, f"{host.name} registered with {_live(event.instances)}",
@@ -140,6 +140,7 @@ def _registered_again(
     note_devices(state, host, event.description.devices, now)
     replication.note_states(state, host, event.snapshots, now)
     if state.hosts.redescribe(host, event.description):
+        save_host(state, host)
         labels = dict(host.description.labels)
         shown = ", ".join(f"{key}={value}" for key, value in labels.items()) or "none"
         message = f"{host.name} has other labels: {shown}"
@@ -191,9 +192,10 @@ def _name_taken(state: MasterState, known: Host | None, event: happened.HostRegi
 
 
 def save_host(state: MasterState, host: Host) -> None:
-    """Persist the desired state of a host."""
+    """Persist the desired state of a host, and its labels, by which neighbour rules refer to it."""
     desired = {"host_id": host.host_id, "cordoned": host.cordoned, "draining": host.draining}
-    state.emit(Intent("host", host.name, desired))
+    labels = {"labels": dict(host.description.labels)} if host.has_labels else {}
+    state.emit(Intent("host", host.name, {**desired, **labels}))
 
 
 def host_left(state: MasterState, event: happened.HostLeft, now: float) -> None:

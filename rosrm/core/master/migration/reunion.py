@@ -45,7 +45,9 @@ def _why_separated(state: MasterState, process: Process) -> str:
     for rule in process.spec.neighbours:
         for name in rule.processes if rule.requires_near else ():
             there, _ = host_of(state, name)
-            if there is not None and not same_place(here, there, rule.by):
+            if there is None or not (there.has_labels or not rule.by):
+                continue
+            if not same_place(here, there, rule.by):
                 return f"it runs on {here.name}, and not near {name}, which runs on {there.name}"
     return ""
 

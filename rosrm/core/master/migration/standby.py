@@ -125,11 +125,15 @@ def _demand(
     )
     for host in state.hosts.hosts:
         for label in apart_by:
+            if label not in labels:
+                why = f"{primary.name}, the host of the primary, has no label {label!r}"
+                excluded.setdefault(host.name, f"{why}, in which the standby must differ")
+                continue
             value = host.description.labels.get(label)
             if value is None:
                 why = f"it has no label {label!r}, in which the standby must differ"
                 excluded.setdefault(host.name, why)
-            elif value == labels.get(label):
+            elif value == labels[label]:
                 why = f"it has {label}={value}, as the host of the primary"
                 excluded.setdefault(host.name, why)
     return Demand(

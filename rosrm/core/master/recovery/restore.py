@@ -50,8 +50,9 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     by_id = sorted(intents("host").items(), key=lambda item: int(item[1]["host_id"]))
     for name, host in by_id:
         state.hosts.expect(
-            name, now, cordoned=bool(host["cordoned"]), draining=bool(host.get("draining"))
-        )
+            name, now, cordoned=bool(host["cordoned"]), draining=bool(host.get("draining")),
+            labels=host.get("labels"),  # absent in older journals
+        )  # fmt: skip
     for program, amounts in intents("learned").items():
         state.learned.restore(program, amounts)
     removed = ((int(one["next"]), name) for name, one in intents("removed").items())

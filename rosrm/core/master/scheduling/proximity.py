@@ -29,7 +29,12 @@ def keeping_all(table: HostTable, demand: Demand) -> BoolArray | None:
 
 
 def keeping(table: HostTable, neighbour: Neighbour) -> BoolArray:
-    """Return the mask, (H,), of the hosts that keep a rule."""
+    """Return the mask, (H,), of the hosts that keep a rule.
+
+    None keeps the rule to run apart from an instance by a label that is not known yet.
+    """
+    if neighbour.relation == "apart" and _unknown_host(table, neighbour):
+        return np.zeros(len(table), np.bool_)
     beside = _beside_any(table, neighbour)
     if neighbour.relation == "near":
         return beside
@@ -65,6 +70,13 @@ def why_not_kept(hosts: Candidates, row: int, neighbour: Neighbour) -> str:
     if neighbour.relation == "near":
         where = " or ".join(sorted({_place(hosts.table, name, by) for name, _ in neighbour.at}))
         return f"{others}, near which the process must run, runs on {where}"
+    unknown = _unknown_host(hosts.table, neighbour)
+    if unknown:
+        them = listed(name for at, name in neighbour.at if at == unknown)
+        return (
+            f"the label {by!r} of {unknown}, the host of {them}, apart from which the process must "
+            f"run, is not known until it reports"
+        )
     beside = listed(_names(_beside(hosts.table, host, neighbour)))
     if not by:
         return f"it runs {beside}, apart from which the process must run"
@@ -86,6 +98,11 @@ def unmet(hosts: Candidates, row: int) -> str:
         elif neighbour.relation == "apart" and beside:
             phrases.append(f"+{TERM * len(beside):g}: not apart from {listed(_names(beside))}")
     return "; ".join(phrases)
+
+
+def _unknown_host(table: HostTable, neighbour: Neighbour) -> str:
+    """Return the host of an instance whose place by a label is not known; "": all are known."""
+    return table.with_unknown_label(name for name, _ in neighbour.at) if neighbour.by else ""
 
 
 def _beside_any(table: HostTable, neighbour: Neighbour) -> BoolArray:

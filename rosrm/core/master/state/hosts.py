@@ -6,7 +6,7 @@ values of single hosts (description, labels) are in `Host`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import Final, Literal, NamedTuple
@@ -27,7 +27,7 @@ from rosrm.core.master.state.host_arrays import (
 from rosrm.core.master.state.links import LinkTable
 from rosrm.extensions.plugin_calls import Failing, Plugin
 from rosrm.model.devices import Device, HeldDevice
-from rosrm.model.values import HostDescription, InstanceId, ProcessSpec
+from rosrm.model.values import EMPTY, HostDescription, InstanceId, ProcessSpec
 
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
@@ -69,6 +69,7 @@ class Host:
 
     Attributes:
         column: column of this host in the arrays of `HostTable`.
+        has_labels: its labels are known, from its slave or from the journal.
         attributed, shared: resources with this accounting on the host.
         instances: number of each instance that runs on the host or is assigned to it, to the name
             and the spec of its process.
@@ -90,6 +91,7 @@ class Host:
     column: int
     name: str
     description: HostDescription
+    has_labels: bool = False
     cordoned: bool = False
     draining: bool = False
     drained: bool = False
@@ -162,10 +164,15 @@ class HostTable(HostColumns):
     # --- registration --------------------------------------------------------------------
 
     def expect(
-        self, name: str, now: float = 0.0, *, cordoned: bool = False, draining: bool = False
-    ) -> Host:
-        """Add a host before its first contact, so that its number stays across restarts."""
-        host = Host(self.add_column(), name, HostDescription(name, 0))
+        self, name: str, now: float = 0.0, *, cordoned: bool = False, draining: bool = False,
+        labels: Mapping[str, str] | None = None,
+    ) -> Host:  # fmt: skip
+        """Add a host before its first contact, so that its number stays across restarts.
+
+        `labels`: those that the host had before the restart; None: unknown.
+        """
+        described = HostDescription(name, 0, labels=labels or EMPTY)
+        host = Host(self.add_column(), name, described, labels is not None)
         self.hosts.append(host)
         self.devices.add_column()
         self.by_name[name] = host
@@ -179,7 +186,7 @@ class HostTable(HostColumns):
         """Register a host, or the new run of a known host's slave, without readings yet."""
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
-        host.description, host.pruned = description, False
+        host.description, host.has_labels, host.pruned = description, True, False
         host.attributed = description.accounted("attributed")
         host.shared = description.accounted("shared")
         self._listed = None
@@ -225,6 +232,7 @@ class HostTable(HostColumns):
     def prune(self, host: Host) -> None:
         """Remove a host from every listing; its slave may register it later as a new host."""
         host.pruned, host.description = True, HostDescription(host.name, 0)
+        host.has_labels = False
         self._listed = None
         limits = host.exceeded_since, host.over_since, host.over_at
         for known in (*limits, host.recorded_at, host.blocked, host.failing):
@@ -266,6 +274,11 @@ class HostTable(HostColumns):
             found = [host.description.labels.get(key) == value for host in self.hosts]
             known = self._labelled[key, value] = np.array(found, np.bool_)
         return known
+
+    def with_unknown_label(self, names: Iterable[str]) -> str:
+        """Return the first of some hosts whose labels are not known; "": all are known."""
+        hosts = (self.by_name.get(name) for name in names)
+        return next((one.name for one in hosts if one and not (one.has_labels or one.pruned)), "")
 
     def enforcing(self, settings: tuple[str, ...], cpus: tuple[int, ...]) -> BoolArray:
         """Return the mask, (H,), of hosts that can enforce these settings and have these CPUs.
