@@ -587,13 +587,16 @@ class MasterState:
         self.add_instance(instance, spec, host, now, demand, need, devices=chosen)
 
     def reserve_rest(self, instance: Instance) -> None:
-        """Reserve the part of the demand of an instance that the readings do not show yet."""
-        host = instance.host
-        ended = instance.estimated if instance.settled else frozenset()
-        if instance.shown:
-            ended |= host.shared
-        left = {}
-        for resource, amount in instance.demand.items():
+        """Reserve the part of the demand of an instance that the readings do not show yet.
+
+        An estimate ends after `settle`. Usage that was measured before a move ends when the
+        readings show the instance at its new host. The declared needs stay.
+        """
+        host, needs, left = instance.host, instance.spec.needs, dict[str, float]()
+        ended = host.shared if instance.shown else frozenset()
+        for resource, placed in instance.demand.items():
+            is_over = instance.settled if resource in instance.estimated else instance.shown
+            amount = min(placed, needs.get(resource, 0.0)) if is_over else placed
             shown = instance.seen.get(resource, 0.0) if resource in host.attributed else 0.0
             if amount > shown and resource not in ended:
                 left[resource] = amount - shown

@@ -9,7 +9,7 @@ from rosrm.core.master.state.process import Instance
 from rosrm.model.records import Intent
 from rosrm.model.values import InstanceState, InstanceStatus, is_plausible
 
-#: Shortest run, in seconds, that shows the CPU use of a program; before, start-up dominates.
+#: Shortest run, in seconds, that shows the use of a program; before, start-up dominates.
 _TELLING_RUN: Final = 1.0
 
 
@@ -34,15 +34,25 @@ def _is_shown(instance: Instance, now: float, settle: float) -> bool:
 
 
 def learn_from(state: MasterState, instance: Instance, status: InstanceStatus) -> None:
-    """Learn the needs of a program from the resources that a run used."""
+    """Learn the needs of a program from the resources that a run used.
+
+    A run that was too short or has failed may not have got far: it raises the needs, and never
+    lowers them.
+    """
     if status.state is InstanceState.REFUSED:
         return
-    cpu = status.cpu_time / status.run_time if status.run_time >= _TELLING_RUN else 0.0
+    is_telling = status.run_time >= _TELLING_RUN
+    cpu = status.cpu_time / status.run_time if is_telling else 0.0
     peaks = instance.peak | {
         "memory": max(status.peak_memory, instance.peak.get("memory", 0.0)),
         "cpu": max(cpu, instance.peak.get("cpu", 0.0)),
     }
     plausible = {name: used for name, used in peaks.items() if is_plausible(name, used)}
-    counts = state.learned.learn(instance.spec.program, plausible)
+    may_lower = is_telling and not _has_failed(status)
+    counts = state.learned.learn(instance.spec.program, plausible, may_lower=may_lower)
     if counts is not None:
         state.emit(Intent("learned", instance.spec.program, counts))
+
+
+def _has_failed(status: InstanceStatus) -> bool:
+    return status.state is InstanceState.FAILED or bool(status.exit_code)

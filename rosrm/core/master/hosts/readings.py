@@ -43,7 +43,7 @@ def take_readings(table: HostTable, readings: ReadingsReceived, now: float) -> B
     late = known & ~fresh
     table.refused_since[at[fresh]] = np.inf
     table.refused_since[at[late]] = np.minimum(table.refused_since[at[late]], now)
-    table.last_contact[at[fresh]] = now
+    table.last_contact[at[fresh]] = table.read_at[at[fresh]] = now
     table.sequence[at[fresh]] = readings.sequence[fresh]
     table.reported[at[fresh]] = readings.status_sequence[fresh]
     table.stale[at[fresh & ~sane]] = _SLOT_BITS.sum()
@@ -59,8 +59,9 @@ def _in_order(
     """Return the mask of readings that follow the stored ones, or replace a wrong sequence."""
     before = table.sequence[columns]
     step = readings.sequence - before  # unsigned: an older reading is very far ahead
+    most = MOST_AHEAD + table.readings_since(now)[columns]
     is_wrong = now - table.refused_since[columns] >= _WRONG_AFTER
-    return np.asarray((before == 0) | (step <= MOST_AHEAD) | is_wrong)
+    return np.asarray((before == 0) | (step <= most) | is_wrong)
 
 
 def _store(

@@ -247,11 +247,17 @@ def _plan(
 
 
 def _shift(state: MasterState, planned: PlannedMoves, source: Host, freed: FloatArray) -> Shift:
-    """Return planned moves with the loads of their hosts before and after."""
-    columns, then = [source.column, planned.destination.column], freed.copy()
-    for process, _, own, _ in planned.steps:
-        then[:, columns[0]] += share_of(state, state.instances[process.owner])
-        then[:, columns[1]] -= own.need[:, columns[1]]
+    """Return planned moves with the loads of their hosts before and after.
+
+    The destination gets what the source is freed from, whatever need has chosen the destination.
+    Otherwise a process could move back at the same load.
+    """
+    here, there = columns = [source.column, planned.destination.column]
+    capacity, then = state.hosts.capacity, freed.copy()
+    for process, *_ in planned.steps:
+        share = share_of(state, state.instances[process.owner])
+        then[:, here] += share
+        then[:, there] -= np.nan_to_num(share * capacity[:, here] / capacity[:, there])
     before, after = _loads(state, freed)[columns].tolist(), _loads(state, then)[columns].tolist()
     return Shift(planned, source, (before[0], before[1]), (after[0], after[1]))
 

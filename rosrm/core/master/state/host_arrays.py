@@ -48,6 +48,7 @@ class HostColumns:
         report_due: (H,) the host was lost, and has not reported its instances since.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
         last_contact: (H,) time of the newest message.
+        read_at: (H,) time of the newest reading, or of the registration.
         registered: (H,) time of the registration.
         period: (H,) seconds between two readings.
         processes: (H,) number of processes on the host or reserved for it.
@@ -82,6 +83,7 @@ class HostColumns:
             "report_due": np.zeros(columns, np.bool_),
             "stale": np.zeros(columns, np.uint32),
             "last_contact": np.zeros(columns),
+            "read_at": np.zeros(columns),
             "registered": np.full(columns, -np.inf),
             "period": np.zeros(columns),
             "processes": np.zeros(columns, np.int64),
@@ -147,6 +149,7 @@ class HostColumns:
         self.report_due: BoolArray = used["report_due"]
         self.stale: npt.NDArray[np.uint32] = used["stale"]
         self.last_contact: FloatArray = used["last_contact"]
+        self.read_at: FloatArray = used["read_at"]
         self.registered: FloatArray = used["registered"]
         self.period: FloatArray = used["period"]
         self.processes: IntArray = used["processes"]

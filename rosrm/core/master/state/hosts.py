@@ -32,9 +32,12 @@ from rosrm.model.values import EMPTY, HostDescription, InstanceId, ProcessSpec
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
-#: Greatest step from one sequence of a host to the next; a greater one is an error or a forgery.
+#: Greatest step from one sequence of a host to the next, beyond those that the time since explains;
+#: a greater one is an error or a forgery.
 MOST_AHEAD: Final = 1000
 
+#: Shortest period, in seconds, that counts between two readings of a host.
+_SHORTEST_PERIOD: Final = 0.01
 #: Fields of a description that may change while the slave runs.
 CHANGEABLE: Final = ("labels",)
 
@@ -206,7 +209,7 @@ class HostTable(HostColumns):
         self.stale[column] = 0
         self.last_contact[column] = self.registered[column] = self.newest_registration = now
         self.bound[column] = description.max_processes or NO_BOUND
-        self.period[column] = description.period
+        self.period[column], self.read_at[column] = description.period, now
         self.incarnation[column] = description.incarnation
         self.sequence[column] = self.reported[column] = self.status_sequence[column] = 0
         self.refused_since[column] = np.inf
@@ -517,11 +520,17 @@ class HostTable(HostColumns):
         newest = int(self.status_sequence[host.column])
         if sequence <= newest:
             return "late"
-        if newest and sequence - max(newest, int(self.reported[host.column])) > MOST_AHEAD:
+        known = max(newest, int(self.reported[host.column]))
+        if newest and sequence - known > MOST_AHEAD + self.readings_since(now)[host.column]:
             return "far ahead"
         self.status_sequence[host.column] = sequence
         self.last_contact[host.column] = now
         return "next" if sequence == newest + 1 else "after a gap"
+
+    def readings_since(self, now: float) -> FloatArray:
+        """Return twice the number, (H,), of readings that hosts may have sent since the newest."""
+        elapsed: FloatArray = 2.0 * (now - self.read_at) / np.maximum(self.period, _SHORTEST_PERIOD)
+        return elapsed
 
     def is_accepting(self, host: Host) -> bool:
         """Return True if a host is under all its limits and has requested work."""

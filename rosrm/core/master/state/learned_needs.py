@@ -43,14 +43,21 @@ class LearnedNeeds:
         self._counts[program] = dict(amounts)
         self._mean[program] = dict(amounts)
 
-    def learn(self, program: str, amounts: Mapping[str, float]) -> Mapping[str, float] | None:
-        """Learn the peaks of one run; return the new learned needs, None: unchanged."""
+    def learn(
+        self, program: str, amounts: Mapping[str, float], *, may_lower: bool = True
+    ) -> Mapping[str, float] | None:
+        """Learn the peaks of one run; return the new learned needs, None: unchanged.
+
+        `may_lower`: False: a smaller peak than the known one shows nothing.
+        """
         mean = self._mean.setdefault(program, {})
         counts = self._counts.setdefault(program, {})
         changed = False
         for resource, amount in amounts.items():
             if amount > 0.0:
                 before = mean.get(resource, amount)
+                if amount < before and not may_lower:
+                    continue
                 mean[resource] = before + _NEWEST * (amount - before)
                 counted = counts.get(resource, 0.0)
                 if abs(mean[resource] - counted) > _NOTICEABLE * counted:
