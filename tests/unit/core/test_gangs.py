@@ -17,6 +17,7 @@ from rosrm.core.master.assignment.gang_search import Blocked, find_places
 from rosrm.core.master.assignment.gangs import members_of
 from rosrm.core.master.commands import Assign, Command
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration.preemption import preempt
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.requester import Requester
 from rosrm.model.values import HostLossPolicy, NeighbourRule, ProcessSpec
@@ -398,6 +399,51 @@ def test_room_is_made_for_each_process_of_a_gang() -> None:
     cluster.wait(10.0)
     assert phases(cluster) == ["running"] * 2
     assert (cluster.phase("low"), cluster.phase("lower")) == ("queued", "queued")
+
+
+def preempted(cluster: Cluster, name: str) -> int:
+    """Return how often a process has made room."""
+    kind = "preempted"
+    return sum(one.kind == kind and one.process == name for one in cluster.records)
+
+
+@pytest.mark.parametrize("preemption", ["requeue", "move"])
+def test_no_process_makes_room_for_a_gang_that_cannot_be_placed_as_a_whole(
+    preemption: str,
+) -> None:
+    """The other process of the gang has room nowhere, whoever leaves."""
+    cluster = cluster_of("abc", preemption=preemption).with_processes(
+        process("vital", memory=700, priority=9), process("too", memory=700, priority=9),
+        movable("low", memory=300),
+    )  # fmt: skip
+    cluster.submit(*gang(600, 600, priority=5))
+    cluster.wait(600.0, tick=0.5)
+    assert (cluster.phase("low"), preempted(cluster, "low")) == ("running", 0)
+    assert cluster.phase("sensing-0") == "queued"
+
+
+def test_no_process_makes_room_for_a_gang_whose_other_room_is_protected() -> None:
+    """Room must be made on two hosts, and on one of them it cannot be."""
+    cluster = cluster_of("ab", preemption="requeue").with_processes(
+        process("low", memory=600), process("kept", memory=600, protect=True)
+    )
+    cluster.submit(*gang(500, 500, priority=5))
+    cluster.wait(300.0, tick=0.5)
+    assert (cluster.phase("low"), preempted(cluster, "low")) == ("running", 0)
+
+
+def test_a_trial_of_room_for_a_gang_changes_nothing() -> None:
+    """The room, the devices and the queue are as before."""
+    cluster = cluster_of("abc", preemption="requeue", cooldown=1.0).with_processes(
+        process("vital", memory=700, priority=9), process("too", memory=700, priority=9),
+        process("low", memory=300),
+    )  # fmt: skip
+    cluster.submit(*gang(600, 600, priority=5))
+    cluster.wait(2.0)
+    before = picture(cluster.state)
+    cluster.now += 10.0
+    preempt(cluster.state, cluster.now)
+    assert picture(cluster.state) == before
 
 
 # --- properties -------------------------------------------------------------------------------

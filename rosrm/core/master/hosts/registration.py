@@ -79,6 +79,7 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
     for instance in state.instances_of(host):  # restored before the host's capacities were known
         settle_reservation(state, instance, now)
     _clear_exclusions(state, host)
+    state.preemption.forget(host.name)
     _execute_again(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))

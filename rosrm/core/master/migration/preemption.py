@@ -5,7 +5,10 @@ again. The set with the fewest processes is chosen; of equal sets the one with t
 priorities. Processes of other users make room only for a process of an operator, because another
 owner could not stop them by a request. Until the process is placed, its host takes no process of a
 lower priority; otherwise that one could take the room. Such a claim ends with the placement, when
-the process does not fit in spite of the room, or at its deadline.
+the process does not fit in spite of the room, or at its deadline; the host is then tried again only
+after a back-off.
+
+Nothing leaves a host unless the process, with its whole gang, would find its places then.
 
 A set is a union of groups: processes that must stay on one host leave it together.
 """
@@ -13,6 +16,7 @@ A set is a union of groups: processes that must stay on one host leave it togeth
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 from itertools import combinations, islice
 from math import inf
@@ -22,11 +26,14 @@ import numpy as np
 
 from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.demands import demand_of, ranking_of
+from rosrm.core.master.assignment.gang_search import Blocked, find_places
+from rosrm.core.master.assignment.gangs import members_of
 from rosrm.core.master.assignment.neighbours import awaited_neighbour, running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
 from rosrm.core.master.migration.room import (
     CLOSE,
+    Trial,
     is_leaving,
     share_of,
     trial,
@@ -39,6 +46,7 @@ from rosrm.core.master.rights import may_affect
 from rosrm.core.master.scheduling.candidates import candidates
 from rosrm.core.master.scheduling.filters import FILTERS, OF_ROOM, passing
 from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.backoff import Retries
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.moving import RoomMade
@@ -83,23 +91,30 @@ class Group:
     share: FloatArray
 
 
+#: Moves of the groups of a set; None for one that waits in the queue again.
+_Moves = Sequence[PlannedMoves | None]
+_Choice = tuple[Host, Sequence[Group], _Moves]
+
+
 @dataclass(slots=True)
 class _Search:
     """The search for room for one process.
 
     Attributes:
-        tried: names of hosts where the process did not fit in spite of the room.
+        tried: hosts where the process did not fit in spite of the room.
         claim: room that is being made for the process; None: none is.
         against: reasons why processes of lower priorities cannot make room.
         stuck: names of processes that cannot leave their host, whichever others do.
+        freed: numbers of instances that have left already, in a trial.
     """
 
     process: Process
     ranking: Ranking
-    tried: frozenset[str]
+    tried: Retries
     claim: RoomMade | None
     against: list[str] = field(default_factory=list)
     stuck: set[str] = field(default_factory=set)
+    freed: AbstractSet[int] = frozenset()
 
     def deadline(self, departures: int, now: float) -> float:
         """Return the deadline of a claim; a claim that continues keeps its own."""
@@ -176,16 +191,20 @@ def _review(
     """Return the room that is made for a process; None: it needs none."""
     claim = before if before is not None and before.host is not None else None
     ranking = ranking_of(state, demand_of(state, process))
+    search = _Search(process, ranking, before.tried if before else Retries(), claim)
     if ranking.best() >= 0:  # the claim stands until the process is placed
-        return claim if claim is not None and now < claim.deadline else None
+        if claim is None:
+            return None if before is None or now >= before.until else before
+        if now < claim.deadline:
+            return claim
+        why = f"room was made on {_name_of(claim)}, and the process was not placed in time"
+        return _given_up(state, search, claim, why, now)
     if before is not None and claim is None and now < before.until:
         return before
-    tried = before.tried if before is not None else frozenset()
-    search = _Search(process, ranking, tried, claim)
     if claim is not None:
         return _continue(state, search, claim, now)
     hosts = [
-        one for one in _hosts_in_question(state, search)
+        one for one in _hosts_in_question(state, search, now)
         if process.spec.priority > state.hosts.claims.get(one[0].column, -inf)
     ]  # fmt: skip
     for host, missing in hosts:
@@ -199,9 +218,11 @@ def _continue(state: MasterState, search: _Search, claim: RoomMade, now: float) 
     host = claim.host
     assert host is not None
     if now >= claim.deadline:
-        return _expired(state, search, host, now)
+        return _expired(state, search, claim, now)
     leaving = _leaving(state, host)
-    missing = next((lacks for one, lacks in _hosts_in_question(state, search) if one is host), None)
+    missing = next(
+        (lacks for one, lacks in _hosts_in_question(state, search, now) if one is host), None
+    )
     shown = claim.partial and now >= claim.until - _GRACE + _SHOWN
     if missing is None or not (leaving.any() or shown):
         return _wait_for_host(state, search, claim, now)
@@ -225,22 +246,31 @@ def _wait_for_host(state: MasterState, search: _Search, claim: RoomMade, now: fl
     if now < claim.until:
         return claim
     why = f"room was made on {host.name}, and the process does not fit there"
-    return _given_up(state, search, host, why, now)
+    return _given_up(state, search, claim, why, now)
 
 
-def _expired(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
+def _expired(state: MasterState, search: _Search, claim: RoomMade, now: float) -> RoomMade:
     """Give up a host that its processes do not leave in time."""
+    host = claim.host
+    assert host is not None
     leaving = [one.id.process for one in state.instances_of(host) if is_leaving(state, one)]
     why = f"{listed(sorted(leaving))} did not leave {host.name} in time to make room"
     if not leaving:
         why = f"the room on {host.name} could not be made in time"
-    return _given_up(state, search, host, why, now)
+    return _given_up(state, search, claim, why, now)
 
 
-def _given_up(state: MasterState, search: _Search, host: Host, why: str, now: float) -> RoomMade:
-    """Return the outcome for a host that is not tried again while the process waits."""
-    tried = search.tried | {host.name}
-    return RoomMade(None, why, now + state.settings.cooldown, tried=tried)
+def _given_up(
+    state: MasterState, search: _Search, claim: RoomMade, why: str, now: float
+) -> RoomMade:
+    """Return the outcome for a host where room was made in vain; it is tried again later."""
+    search.tried.note(_name_of(claim), why, now, _LONGEST)
+    return RoomMade(None, why, now + state.settings.cooldown, tried=search.tried)
+
+
+def _name_of(claim: RoomMade) -> str:
+    assert claim.host is not None
+    return claim.host.name
 
 
 def _wait_for_room(state: MasterState, search: _Search, host: Host, now: float) -> RoomMade:
@@ -251,7 +281,9 @@ def _wait_for_room(state: MasterState, search: _Search, host: Host, now: float) 
     return RoomMade(host, why, now + _GRACE, tried=search.tried, deadline=deadline)
 
 
-def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, FloatArray]]:
+def _hosts_in_question(
+    state: MasterState, search: _Search, now: float
+) -> list[tuple[Host, FloatArray]]:
     """Return the hosts that lack only room, and what each lacks; those that lack least first.
 
     What a host lacks is (R + 1,): fractions, and places for processes; values below 0 are spare.
@@ -268,7 +300,8 @@ def _hosts_in_question(state: MasterState, search: _Search) -> list[tuple[Host, 
     order = np.argsort(np.maximum(missing, 0.0).sum(axis=0), kind="stable")
     found = [(table.hosts[columns[at]], missing[:, at]) for at in order]
     # Nothing is missing where a policy has a veto.
-    return [one for one in found if (one[1] > CLOSE).any() and one[0].name not in search.tried]
+    failed = search.tried.waiting(now)
+    return [one for one in found if (one[1] > CLOSE).any() and one[0].name not in failed]
 
 
 def _leaving(state: MasterState, host: Host) -> FloatArray:
@@ -292,6 +325,22 @@ def _make_room(
     state: MasterState, search: _Search, hosts: Iterable[tuple[Host, FloatArray]], now: float
 ) -> RoomMade:
     """Let the smallest possible set of processes leave their host; return the outcome."""
+    choice = _choose(state, search, hosts, now)
+    if choice is not None:
+        return _begin(state, search, *choice, now)
+    against = few(dict.fromkeys(search.against), _MOST_REASONS)
+    why = f"no process of a lower priority can make room{': ' * bool(against)}{'; '.join(against)}"
+    return RoomMade(None, why, now + _GRACE, tried=search.tried)
+
+
+def _choose(
+    state: MasterState, search: _Search, hosts: Iterable[tuple[Host, FloatArray]], now: float,
+    *, in_trial: bool = False,
+) -> _Choice | None:  # fmt: skip
+    """Return the smallest set that can leave its host, so that the whole gang finds its places.
+
+    `in_trial`: room is made for another process of the gang, which is checked as a whole.
+    """
     sets = [
         (rank(chosen), host, chosen)
         for host, missing in islice(_with_groups(state, search, hosts), _MOST_HOSTS)
@@ -305,11 +354,47 @@ def _make_room(
             continue
         trials += 1
         moves = _planned(state, search, chosen, now)
-        if moves is not None:
-            return _begin(state, search, host, chosen, moves, now)
-    against = few(dict.fromkeys(search.against), _MOST_REASONS)
-    why = f"no process of a lower priority can make room{': ' * bool(against)}{'; '.join(against)}"
-    return RoomMade(None, why, now + _GRACE, tried=search.tried)
+        if moves is None:
+            continue
+        if in_trial or _all_fit(state, search, chosen, moves, now):
+            return host, chosen, moves
+    return None
+
+
+def _all_fit(
+    state: MasterState, search: _Search, chosen: Sequence[Group], moves: _Moves, now: float
+) -> bool:
+    """Return True if a process and its whole gang would find places after some departures.
+
+    Others may make room for its other processes, too.
+    """
+    members = members_of(state, search.process)
+    with trial(state) as tried:
+        tried.free(one for one in state.instances.values() if is_leaving(state, one))
+        for _ in members:
+            _depart(tried, chosen, moves)
+            found = find_places(state, members)
+            if not isinstance(found, Blocked):
+                return True
+            other = found.process
+            ranking = ranking_of(state, demand_of(state, other))
+            next_search = _Search(other, ranking, search.tried, None, freed=tried.freed)
+            hosts = _hosts_in_question(state, next_search, now)
+            choice = _choose(state, next_search, hosts, now, in_trial=True)
+            if choice is None:
+                break
+            _, chosen, moves = choice
+    beside = f" for {other.name} of its gang" if other is not search.process else ""
+    search.against.append(f"there would still be no room{beside}")
+    return False
+
+
+def _depart(tried: Trial, chosen: Sequence[Group], moves: _Moves) -> None:
+    """Let groups leave their host in a trial."""
+    for group, planned in zip(chosen, moves, strict=True):
+        tried.free(group.instances)
+        if planned is not None:
+            tried.reserve(planned)
 
 
 def _with_groups(
@@ -345,6 +430,8 @@ def _groups(state: MasterState, search: _Search, host: Host, now: float) -> Iter
     for instance in state.instances_of(host):
         process = state.owned_by(instance)
         if process is None or process.name in seen or is_leaving(state, instance):
+            continue
+        if instance.id.number in search.freed:
             continue
         group = (process, *running_with(state, process))
         seen.update(one.name for one in group)
@@ -412,7 +499,7 @@ def _fewest(shares: FloatArray, missing: FloatArray) -> int:
 
 def _planned(
     state: MasterState, search: _Search, chosen: Sequence[Group], now: float
-) -> list[PlannedMoves | None] | None:
+) -> _Moves | None:
     """Return the moves of each group of a set, None for one that waits in the queue again.
 
     Return None if a group can do neither. The moves are planned together, so that each has room
@@ -420,11 +507,11 @@ def _planned(
     """
     moves: list[PlannedMoves | None] = []
     rejected: Process | None = None
-    with trial(state) as reserve:
+    with trial(state) as tried:
         for group in chosen:
             planned = _plan(state, search.process, group.processes[0], now)
             if not isinstance(planned, Rejected):
-                reserve(planned)
+                tried.reserve(planned)
             elif state.settings.preemption != "requeue":
                 rejected = group.processes[0]
                 break
@@ -457,7 +544,7 @@ def _plan(
 
 def _begin(
     state: MasterState, search: _Search, host: Host, chosen: Sequence[Group],
-    moves: Sequence[PlannedMoves | None], now: float,
+    moves: _Moves, now: float,
 ) -> RoomMade:  # fmt: skip
     """Let a set leave its host; moves beyond `max_migrations` begin in a later review.
 

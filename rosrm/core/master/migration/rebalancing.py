@@ -164,14 +164,14 @@ def plan_round(state: MasterState, now: float) -> Round:
     """Return the moves of one round; nothing begins."""
     freed, most = np.zeros_like(state.hosts.busy), state.settings.rebalance_moves
     planned = Round(_spread_text(state, freed), freed)
-    with trial(state) as reserve:
+    with trial(state) as tried:
         while len(planned.moving) < most:
             shift = _best_shift(state, planned, now)
             if shift is None or len(planned.moving) + len(shift.names) > most:
                 break
             for process, *_ in shift.planned.steps:
                 freed[:, shift.source.column] += share_of(state, state.instances[process.owner])
-            reserve(shift.planned)
+            tried.reserve(shift.planned)
             planned.shifts.append(shift)
     return planned
 

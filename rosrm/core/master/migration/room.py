@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
@@ -13,7 +13,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves
 from rosrm.core.master.migration.start import why_cooling_down, why_immovable
 from rosrm.core.master.state.host_arrays import BoolArray, FloatArray
-from rosrm.core.master.state.hosts import SavedColumn
+from rosrm.core.master.state.hosts import Host, SavedColumn
 from rosrm.core.master.state.process import Instance, Process
 from rosrm.model.plan import Aim
 from rosrm.model.values import InstanceId
@@ -71,27 +71,53 @@ def _why_no_room(state: MasterState, process: Process) -> str:
     return f"no host has room for {process.name}" if full.all() else ""
 
 
-@contextmanager
-def trial(state: MasterState) -> Iterator[Callable[[PlannedMoves], None]]:
-    """Yield a function that reserves the room of planned moves until the end of the block.
+class Trial:
+    """Changes of the room on hosts that `trial` undoes.
 
-    The devices of the moves are a part of their room.
+    Attributes:
+        freed: numbers of the instances whose room counts as free.
     """
-    table = state.hosts
-    before: dict[int, SavedColumn] = {}
 
-    def reserve(planned: PlannedMoves) -> None:
-        host = planned.destination
-        column = host.column
-        if column not in before:
-            before[column] = table.saved(host)
+    def __init__(self, state: MasterState) -> None:
+        self.freed = set[int]()
+        self._state, self._table = state, state.hosts
+        self._before: dict[int, tuple[SavedColumn, bool]] = {}
+
+    def reserve(self, planned: PlannedMoves) -> None:
+        """Reserve the room of planned moves, with their devices."""
+        host, table = planned.destination, self._table
+        self._save(host)
         for process, _, own, _ in planned.steps:
-            held = table.devices[column].choose(own.demand.spec.devices)
+            held = table.devices[host.column].choose(own.demand.spec.devices)
             table.hold(host, InstanceId(process.name, 0), held or ())
-            table.add_reservation(host, own.need[:, column], processes=1)
+            table.add_reservation(host, own.need[:, host.column], processes=1)
 
+    def free(self, instances: Iterable[Instance]) -> None:
+        """Free the room of instances, as their ends do once the readings show them."""
+        for one in instances:
+            host, table = one.host, self._table
+            self._save(host)
+            self.freed.add(one.id.number)
+            table.hold(host, one.id, ())
+            table.free(host, share_of(self._state, one))
+
+    def _save(self, host: Host) -> None:
+        table = self._table
+        if host.column not in self._before:
+            self._before[host.column] = table.saved(host), bool(table.accepting[host.column])
+
+    def undo(self) -> None:
+        """Undo all changes."""
+        for saved, accepting in self._before.values():
+            self._table.restore(saved)
+            self._table.set_accepting(saved.column, accepting=accepting)
+
+
+@contextmanager
+def trial(state: MasterState) -> Iterator[Trial]:
+    """Yield a trial, which is undone at the end of the block."""
+    tried = Trial(state)
     try:
-        yield reserve
+        yield tried
     finally:
-        for saved in before.values():
-            table.restore(saved)
+        tried.undo()

@@ -380,6 +380,18 @@ class HostTable(HostColumns):
         self.set_processes(saved.column, saved.processes)
         self.touched.append(saved.column)
 
+    def free(self, host: Host, share: FloatArray) -> None:
+        """Take the share, (R,), of one process off the usage of a host, for a trial."""
+        self.cells[USAGE, :, host.column] -= share
+        self.add_reservation(host, np.zeros(len(share)), processes=-1)
+        self.set_accepting(host.column, accepting=True)
+
+    def set_accepting(self, column: int, *, accepting: bool) -> None:
+        """Set whether a host is under its limits, for a trial."""
+        if bool(self.accepting[column]) is not accepting:
+            self.accepting[column] = accepting
+            self.readings_changed()
+
     def touch(self, host: Host) -> None:
         """Note that something else than the reservations of one host has changed."""
         self.touched.append(host.column)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import inf
 
+from rosrm.core.master.state.backoff import Retries
 from rosrm.core.master.state.hosts import Host
 
 
@@ -18,9 +19,8 @@ class RoomMade:
         until: time until which the host is reserved, although nothing leaves it any more; without a
             host, time before which the master does not look for a set again.
         partial: True: more processes must leave, whose moves had to wait for others.
-        tried: names of hosts where room was made, but which a policy or a reading excludes for
-            another reason, or that was not made in time. They are not tried again while the
-            process waits.
+        tried: hosts where room was made, but which a policy or a reading excludes for another
+            reason, or that was not made in time.
         deadline: time at which the host is given up, whatever still leaves it.
     """
 
@@ -28,7 +28,7 @@ class RoomMade:
     reason: str
     until: float
     partial: bool = False
-    tried: frozenset[str] = frozenset()
+    tried: Retries = field(default_factory=Retries)
     deadline: float = inf
 
 
@@ -43,6 +43,11 @@ class Preemption:
 
     room_made: dict[str, RoomMade] = field(default_factory=dict)
     reviewed: float = -inf
+
+    def forget(self, host: str) -> None:
+        """Forget where room was made in vain, because the host has changed."""
+        for room in self.room_made.values():
+            room.tried.forget(host)
 
 
 @dataclass(slots=True)

@@ -1,0 +1,130 @@
+"""Retries: each has a memory of what failed and a back-off, which a change of the facts ends."""
+
+from __future__ import annotations
+
+from rosrm.core.master.state.backoff import Backoff, Retries
+from rosrm.core.slave import events
+from rosrm.model.values import InstanceState, MigrationPolicy, ProcessSpec
+from tests.unit.core.cluster import Cluster, Machine, node
+
+
+class Broken(Machine):
+    """A host on which each program ends with exit code 1 soon after its start."""
+
+    broken = True
+
+    def tell(self, event: events.Event, now: float) -> None:
+        super().tell(event, now)
+        if self.broken:
+            for one in list(self.programs):
+                self._end(one, InstanceState.FAILED, now, code=1)
+
+
+def moving(*, overlap: bool = True) -> ProcessSpec:
+    return node("p", migration=MigrationPolicy("relaunch", overlap=overlap))
+
+
+def broken_beside(*others: Machine, overlap: bool = True) -> Cluster:
+    """Return a cluster with a process on host a, which cannot run on host b."""
+    cluster = Cluster("a").with_processes(moving(overlap=overlap))
+    cluster.discover("p")
+    for machine in (Broken("b"), *others):
+        cluster.add(machine)
+    return cluster
+
+
+def play(cluster: Cluster, seconds: float) -> int:
+    """Let time pass, in which the node is discovered after each start; return its starts on a."""
+    pids = set[int]()
+    for _ in range(round(seconds / 0.5)):
+        cluster.wait(0.5)
+        for machine in cluster.machines.values():
+            for instance, program in list(machine.programs.items()):
+                if machine.name == "a":
+                    pids.add(program.pid)
+                machine.seen_in_graph(instance.process, cluster.now)
+        cluster.settle()
+    return len(pids)
+
+
+def test_the_wait_after_each_failure_in_a_row_doubles_up_to_the_longest() -> None:
+    """It is never shorter than the first."""
+    backoff = Backoff()
+    assert [backoff.note(0.0, 2.0, 10.0) for _ in range(5)] == [2.0, 4.0, 8.0, 10.0, 10.0]
+    assert Backoff().note(0.0, 20.0, 10.0) == 20.0
+
+
+def test_what_has_failed_waits_longer_than_everything_else() -> None:
+    """A change of it ends both waits."""
+    retries = Retries()
+    retries.note("b", "crashed", 0.0, 30.0)
+    assert (retries.why_none(1.0), retries.waiting(1.0)) == ("crashed", {"b": "crashed"})
+    assert (retries.why_none(3.0), retries.waiting(3.0)) == ("", {"b": "crashed"})
+    assert retries.waiting(31.0) == {}
+    retries.note("b", "crashed", 31.0, 30.0)
+    assert retries.waiting(90.0) == {"b": "crashed"}
+    retries.forget("b")
+    assert (retries.why_none(31.5), retries.waiting(31.5)) == ("", {})
+
+
+def test_a_drain_does_not_restart_a_process_again_and_again() -> None:
+    """The process fails on the only other host, and each move stops it first."""
+    cluster = broken_beside(overlap=False)
+    cluster.set_host("a", "drain")
+    assert play(cluster, 600.0) <= 7
+    assert cluster.where("p") == ["a"]
+
+
+def test_a_host_is_drained_although_moves_off_it_have_failed() -> None:
+    """It says once what is left and why; the moves are tried again later."""
+    cluster = broken_beside()
+    cluster.set_host("a", "drain")
+    play(cluster, 3.0)
+    assert cluster.state.hosts.by_name["a"].drained
+    (drained,) = cluster.recorded("host_drained")
+    assert "p may run on no other host: b: its move to b has failed" in drained
+    assert "the move is tried again later" in drained
+    cluster.machines["b"].broken = False
+    play(cluster, 60.0)
+    assert cluster.where("p") == ["b"]
+    assert cluster.recorded("host_drained")[-1] == "a is drained: no process is left"
+
+
+def test_a_drain_tries_another_host_after_a_failed_one() -> None:
+    """The memory is of the process and its destination."""
+    cluster = broken_beside(Machine("c", busy={"memory": 0.6, "cpu": 0.1}))
+    cluster.set_host("a", "drain")
+    play(cluster, 10.0)
+    assert cluster.where("p") == ["c"]
+    assert len(cluster.recorded("stayed")) == 1
+
+
+def test_an_eviction_does_not_repeat_a_failing_destination_at_each_cool_down() -> None:
+    """The waits double."""
+    cluster = broken_beside(overlap=False)
+    cluster.machines["a"].busy["memory"] = 0.85
+    cluster.machines["a"].shown["p"] = {"memory": 2.0**30}
+    assert play(cluster, 1800.0) <= 9
+
+
+def test_a_new_run_of_the_slave_forgets_failed_moves_to_its_host() -> None:
+    """Whatever the process lacked there may have been installed."""
+    cluster = broken_beside()
+    cluster.set_host("a", "drain")
+    play(cluster, 3.0)
+    cluster.machines["b"].broken = False
+    cluster.cut("b", seconds=2.0)
+    cluster.restart_slave("b")
+    play(cluster, 5.0)
+    assert cluster.where("p") == ["b"]
+
+
+def test_a_user_may_repeat_a_failed_move_at_once() -> None:
+    """A request has no back-off."""
+    cluster = broken_beside()
+    assert cluster.migrate("p").accepted
+    play(cluster, 1.0)
+    cluster.machines["b"].broken = False
+    assert cluster.migrate("p", "b").accepted
+    play(cluster, 5.0)
+    assert cluster.where("p") == ["b"]
