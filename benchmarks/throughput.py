@@ -18,6 +18,7 @@ from benchmarks.hosts import three_hosts
 from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
+from rosrm.errors import RosrmError
 from rosrm.model.values import Kind, ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
 
@@ -47,6 +48,8 @@ def wait_for_all(
         if row.state == "finished":
             waiting.pop()
             continue
+        if row.state == "failed":
+            raise RosrmError(f"{row.name} failed: {row.reason}")
         if time.monotonic() >= deadline:
             raise TimeoutError(f"{row.name} did not finish in {timeout:g} s: it is {row.state}")
         cluster.client.spin(0.02)
