@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import selectors
 import signal
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from typing import Final
 
 from rosrm.core.supervisor.events import Event, Exited, SessionEnded
@@ -36,14 +36,16 @@ class ProcessTrees:
         happened: receives an event for each change of an instance.
         groups: control groups of the instances, which have all their processes.
         reaped: called with the pid of an ended child that is not known as a leader; it may add it.
+        starting: children that are no leaders yet, although they may execute their programs.
     """
 
     def __init__(
         self, state: str, selector: selectors.BaseSelector, happened: Callable[[Event], None],
-        groups: InstanceGroups, reaped: Callable[[int], None],
+        groups: InstanceGroups, reaped: Callable[[int], None], starting: Container[int] = (),
     ) -> None:  # fmt: skip
         self._groups = groups
         self._reaped = reaped
+        self._starting = starting
         self._state = state
         self._selector = selector
         self._happened = happened
@@ -209,7 +211,7 @@ class ProcessTrees:
     def _look_at_adopted(self) -> None:
         """Find the instance of each adopted child; kill it if that has no leader."""
         for pid in procfs.own_children():
-            if pid not in self._children and pid not in self._adopted:
+            if not any(pid in known for known in (self._children, self._adopted, self._starting)):
                 key = self._owner(pid)
                 self._adopted[pid] = key
                 if key is not None and key not in self._sessions:

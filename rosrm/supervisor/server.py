@@ -98,8 +98,9 @@ class Server:
         self._core = SupervisorState()
         self._confinement = Confinement(state)
         self._groups = self._confinement.groups
+        self._starts: dict[int, _Start] = {}  # by pid, before the exec
         self._trees = ProcessTrees(
-            state, self._selector, self._happened, self._groups, self._reaped
+            state, self._selector, self._happened, self._groups, self._reaped, self._starts
         )
         self._record = InstanceRecord(state)
         self._last_contact = lease_file.LastContact(state)
@@ -109,7 +110,6 @@ class Server:
         self._environments: dict[str, dict[str, str]] = {}
         self._notes: list[str] = []
         self._spawns: deque[Key] = deque()
-        self._starts: dict[int, _Start] = {}  # by pid, before the exec
         self._stuck: dict[int, tuple[str, str]] = {}  # killed before the exec: process, its step
         self._prepared: Key | None = None
         self._ended: list[Key] = []  # with control groups that are still to be removed
@@ -139,6 +139,10 @@ class Server:
     def _take_in(self, timeout: float | None) -> None:
         """Handle the events that arrive within `timeout` seconds; None: wait for the first."""
         for key, _ in self._selector.select(timeout):
+            # A call may close the descriptor of a later event, such as the report of a start whose
+            # end was noticed first. Its number may even belong to another descriptor by now.
+            if self._selector.get_map().get(key.fileobj) is not key:
+                continue
             call: Callable[[], None] = key.data
             call()
 

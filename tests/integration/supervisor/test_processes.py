@@ -6,6 +6,7 @@ import itertools
 import os
 import re
 import signal
+import time
 from functools import partial
 
 import pytest
@@ -43,6 +44,18 @@ def test_exit_status_usage_and_output_are_kept(host, client):
     assert 0 < status.run_time < 10
     assert status.peak_memory > 0
     assert host.log("short").read_text() == "out\nerr\n"
+
+
+def test_many_short_processes_at_once_leave_the_supervisor_alive(host, client):
+    """Starts and ends that arrive in one batch of events do not disturb each other."""
+    names = [f"short{number}" for number in range(150)]
+    client.start([host.order(name, "true") for name in names])
+    running, deadline = set(names), time.monotonic() + PATIENCE
+    while running and time.monotonic() < deadline:
+        for status in client.receive(deadline - time.monotonic()):
+            if status.state is InstanceState.EXITED:
+                running.discard(status.instance.process)
+    assert not running
 
 
 def test_a_crash_is_reported_with_its_signal(host, client):
