@@ -213,9 +213,9 @@ def _cpu_limits(group: Group, root: Path) -> list[tuple[Path, float]]:
         cores = _quota(group.version, directory)
         if cores is not None and cores < machine:
             limits.append((directory, cores))
-    cpus = _set_size(root)
-    if cpus is not None and cpus < machine:
-        limits.append((group.directory, float(cpus)))
+    found = _cpu_set(group, root)
+    if found is not None and found[1] < machine:
+        limits.append(found)
     return limits
 
 
@@ -230,17 +230,33 @@ def _quota(version: int, directory: Path) -> float | None:
     return quota / period if quota is not None and period else None
 
 
-def _set_size(root: Path) -> int | None:
-    """Return the size of the group's effective CPU set, which includes the limits of ancestors."""
-    group = find_group("cpuset", root)
-    if group is None:
+def _cpu_set(group: Group, root: Path) -> tuple[Path, float] | None:
+    """Return the topmost group with the effective CPU set of this process, and the set's size.
+
+    Only there all processes are measured that share these CPUs. The process itself may be in a
+    group below, such as that of the agents. None: no CPU set.
+
+    Args:
+        group: of the controller "cpu".
+        root: of the file system.
+    """
+    sets = find_group("cpuset", root)
+    if sets is None:
         return None
-    name = "cpuset.effective_cpus" if group.version == 1 else "cpuset.cpus.effective"
-    try:
-        text = (group.directory / name).read_text()
-    except OSError:  # the controller is not enabled for this group
+    name = "cpuset.effective_cpus" if sets.version == 1 else "cpuset.cpus.effective"
+    own, top = 0, sets.directory
+    for directory in sets.upward():
+        try:
+            size = count_cpus((directory / name).read_text())
+        except OSError:  # the controller is not enabled for this group, so that above counts
+            continue
+        if own and size != own:  # the set above contains this one, so another size is another set
+            break
+        own, top = size, directory
+    if not own:
         return None
-    return count_cpus(text) or None
+    same = group.mount / top.relative_to(sets.mount)
+    return (same if same.is_dir() else group.directory), float(own)
 
 
 class SliceCpu:

@@ -39,11 +39,13 @@ class ProcessFiles:
     Args:
         proc: mount point of the process file system.
         name: of the file below /proc/PID.
+        size: bytes of interest.
     """
 
-    def __init__(self, proc: Path, name: str) -> None:
+    def __init__(self, proc: Path, name: str, size: int = 1024) -> None:
         self._proc = str(proc)
         self._name = name
+        self._size = size
         self._descriptors: dict[int, int] = {}
         self._pids: Sequence[int] = ()
 
@@ -66,7 +68,7 @@ class ProcessFiles:
         descriptor = self._descriptors.get(pid)
         if descriptor is not None:
             try:
-                return os.pread(descriptor, 1024, 0)
+                return os.pread(descriptor, self._size, 0)
             except ProcessLookupError:
                 # That process has ended, and the kernel may have reused its pid.
                 self._drop({pid})
@@ -76,7 +78,7 @@ class ProcessFiles:
             return b""
         self._descriptors[pid] = descriptor
         try:
-            return os.pread(descriptor, 1024, 0)
+            return os.pread(descriptor, self._size, 0)
         except ProcessLookupError:
             return b""
         finally:

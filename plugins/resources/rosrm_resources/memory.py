@@ -1,8 +1,13 @@
-"""Probe `memory`: bytes that are not available to another process."""
+"""Probe `memory`: bytes that are not available to another process.
+
+The memory of processes, of control groups and of slices is the same quantity, so that each can be
+compared with the others: anonymous and shared memory. Pages of files are no need, because the
+kernel drops them. On a whole machine the kernel's own memory counts too.
+"""
 
 from __future__ import annotations
 
-import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -12,7 +17,14 @@ from rosrm_resources.cgroups import Group, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 
-_PAGE: Final = os.sysconf("SC_PAGE_SIZE")
+#: Lines of /proc/PID/status with the memory of a process, in KiB.
+_USED: Final = re.compile(rb"^Rss(?:Anon|Shmem):\s*(\d+)", re.MULTILINE)
+#: Keys of memory.stat with the same memory. Only the totals of version 1 include the groups below.
+_KEYS: Final = {1: (b"total_rss", b"total_shmem"), 2: (b"anon", b"shmem")}
+#: Keys of the page cache, for a kernel that does not count shared memory.
+_CACHE: Final = {
+    1: (b"total_inactive_file", b"total_active_file"), 2: (b"inactive_file", b"active_file"),
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,7 +60,8 @@ class MachineMemory:
     """Memory that the kernel cannot give without swapping; reclaimable cache is not usage.
 
     The values come from /proc/meminfo, as in `psutil.virtual_memory`; ten reads a second of the
-    file itself cost a third.
+    file itself cost a third. The cache of ZFS (ARC) shrinks as the page cache does, but
+    MemAvailable leaves it out.
 
     Args:
         proc: mount point of the process file system.
@@ -58,15 +71,30 @@ class MachineMemory:
 
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._file = OpenFile(proc / "meminfo", 256)
+        arc = proc / "spl/kstat/zfs/arcstats"
+        self._arc = OpenFile(arc, 1 << 14) if arc.exists() else None
         self.capacity: Final = self._bytes(b"MemTotal:")
 
     def usage(self) -> float:
         """Return the fraction of the machine's memory in use."""
-        return 1.0 - self._bytes(b"MemAvailable:") / self.capacity
+        return max(0.0, 1.0 - self.available() / self.capacity)
+
+    def available(self) -> float:
+        """Return the bytes that new processes can use."""
+        return self._bytes(b"MemAvailable:") + self._reclaimable_arc()
 
     def close(self) -> None:
-        """Close /proc/meminfo."""
+        """Close the files."""
         self._file.close()
+        if self._arc is not None:
+            self._arc.close()
+
+    def _reclaimable_arc(self) -> float:
+        if self._arc is None:
+            return 0.0
+        rows = (line.split() for line in self._arc.read().splitlines())
+        values = {row[0]: int(row[2]) for row in rows if len(row) == 3 and row[2].isdigit()}
+        return float(max(0, values.get(b"size", 0) - values.get(b"c_min", 0)))
 
     def _bytes(self, key: bytes) -> float:
         after = self._file.read().split(key, 1)[1]
@@ -76,16 +104,21 @@ class MachineMemory:
 class CgroupMemory:
     """Memory usage against the limit of the control group.
 
-    Where several nested groups have a limit, the one with the least room counts.
+    Where several nested groups have a limit, the one with the least room counts. A machine with
+    less room than the groups leaves no more than it has.
 
     Args:
         limits: (directory of a group, bytes that it may use); the smallest gives the capacity.
         version: of the control groups, 1 or 2.
+        machine: memory of the machine; None: unknown.
     """
 
     scope: Final = "cgroup"
 
-    def __init__(self, limits: list[tuple[Path, float]], version: int) -> None:
+    def __init__(
+        self, limits: list[tuple[Path, float]], version: int, machine: MachineMemory | None = None
+    ) -> None:
+        self._machine = machine
         self.capacity: Final = min(limit for _, limit in limits)
         self._levels = [(limit, _GroupBytes(directory, version)) for directory, limit in limits]
 
@@ -101,37 +134,44 @@ class CgroupMemory:
         if group is None:
             return None
         machine = MachineMemory(root / "proc")
-        machine.close()
         limits = _memory_limits(group, machine.capacity)
-        return cls(limits, group.version) if limits else None
+        if limits:
+            return cls(limits, group.version, machine)
+        machine.close()
+        return None
 
     def usage(self) -> float:
         """Return the fraction of the capacity that is no longer available."""
         room = min(limit - used.read() for limit, used in self._levels)
+        if self._machine is not None:
+            room = min(room, self._machine.available())
         return max(0.0, 1.0 - room / self.capacity)
 
     def close(self) -> None:
         """Close the control files."""
         for _, used in self._levels:
             used.close()
+        if self._machine is not None:
+            self._machine.close()
 
 
 class _GroupBytes:
-    """Bytes in use of a control group, without inactive page cache, which is reclaimed at once."""
+    """Anonymous and shared memory of a control group in bytes."""
 
     def __init__(self, directory: Path, version: int) -> None:
         current = "memory.usage_in_bytes" if version == 1 else "memory.current"
-        # In version 1 only the totals include the groups below, as the usage does.
-        self._key = b"\ntotal_inactive_file " if version == 1 else b"\ninactive_file "
+        self._keys, self._cache = _KEYS[version], _CACHE[version]
         self._current = OpenFile(directory / current, 64)
         self._stat = OpenFile(directory / "memory.stat")
 
     def read(self) -> float:
-        current = int(self._current.read())
-        _, key, after = self._stat.read().partition(self._key)
-        inactive = int(after.split(None, 1)[0]) if key else 0
+        words = self._stat.read().split()
+        numbers = dict(zip(words[::2], map(int, words[1::2]), strict=False))
+        if all(key in numbers for key in self._keys):
+            return float(sum(numbers[key] for key in self._keys))
+        cache = sum(numbers.get(key, 0) for key in self._cache)
         # The difference can be negative, because the two files are read at different times.
-        return float(max(0, current - inactive))
+        return float(max(0, int(self._current.read()) - cache))
 
     def close(self) -> None:
         self._current.close()
@@ -152,10 +192,9 @@ def _memory_limits(group: Group, machine: float) -> list[tuple[Path, float]]:
 
 
 class SliceMemory:
-    """Resident memory of the slave's own process tree, against a budget.
+    """Anonymous and shared memory of the slave's own process tree, against a budget.
 
-    Shared pages count in each process, so the sum is too high rather than too low. For the private
-    part of each process the kernel would walk over all its pages.
+    Shared memory counts in each process, so the sum is too high rather than too low.
 
     Args:
         size: the budget, bytes.
@@ -168,14 +207,14 @@ class SliceMemory:
     def __init__(self, size: float, sessions: Sessions, proc: Path = Path("/proc")) -> None:
         self.capacity: Final = size
         self._sessions = sessions
-        self._files = ProcessFiles(proc, "statm")
+        self._files = ProcessFiles(proc, "status", 4096)
 
     def usage(self) -> float:
         """Return the fraction of the budget in use."""
-        pages = 0
-        for _, line in self._files.read(self._sessions.pids()):
-            pages += int(line.split(None, 2)[1])
-        return pages * _PAGE / self.capacity
+        used = 0
+        for _, content in self._files.read(self._sessions.pids()):
+            used += sum(map(int, _USED.findall(content)))
+        return used * 1024 / self.capacity
 
     def close(self) -> None:
         """Close the process files."""

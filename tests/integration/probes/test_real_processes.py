@@ -127,6 +127,19 @@ def test_slice_memory_is_what_the_processes_hold(start):
     gauge.close()
 
 
+def test_a_slice_uses_what_its_processes_use(start):
+    """`rosrm hosts` shows the sum of `rosrm ps`, because both count the same memory."""
+    sessions = SessionTable()
+    gauge = SliceMemory(1000.0 * MIB, sessions)
+    for _ in range(10):
+        sessions.add(start(HOLD, str(10 * MIB), ready=True).pid)
+    sessions.refresh(0.0)
+    used = sum(one.memory for one in sessions.usage().values())
+    assert used > 100 * MIB
+    assert gauge.usage() * gauge.capacity == pytest.approx(used, rel=0.03)
+    gauge.close()
+
+
 def test_writers_of_a_disk_are_found(start, tmp_path):
     """A process counts with what it has written if it writes much, and to this file system."""
     if Path("/dev/shm").stat().st_dev == tmp_path.stat().st_dev or not on_a_disk(tmp_path):

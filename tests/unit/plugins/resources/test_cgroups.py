@@ -36,10 +36,49 @@ def grow_cpu(directory, seconds):
 
 
 def test_memory_of_a_container():
-    """The container's limit is the capacity, and inactive page cache is not usage."""
+    """The container's limit is the capacity; anonymous and shared memory are its usage."""
     gauge = CgroupMemory.find(TREES / "docker")
     assert gauge.capacity == 2 * GIB
-    assert gauge.usage() == pytest.approx(600 * MIB / (2 * GIB))
+    assert gauge.usage() == pytest.approx((450 + 1) * MIB / (2 * GIB))
+    gauge.close()
+
+
+def test_page_cache_is_no_usage(tree):
+    """A process that reads large files fills the cache, active or not, and puts no host over."""
+    root = tree("docker")
+    group = root / "sys/fs/cgroup"
+    (group / "memory.current").write_text(f"{2 * GIB}\n")
+    stat = "anon 44040192\nshmem 0\ninactive_file 300000000\nactive_file 1700000000\n"
+    (group / "memory.stat").write_text(stat)
+    gauge = CgroupMemory.find(root)
+    assert gauge.usage() == pytest.approx(42 * MIB / (2 * GIB))
+    gauge.close()
+
+
+def test_a_full_machine_leaves_no_room_in_a_group(tree):
+    """The limit of a container promises no memory that its machine does not have."""
+    root = tree("docker")
+    (root / "proc/meminfo").write_text("MemTotal: 16777216 kB\nMemAvailable: 524288 kB\n")
+    gauge = CgroupMemory.find(root)
+    assert gauge.usage() == pytest.approx(0.75)
+    gauge.close()
+
+
+def test_the_group_of_a_cpu_set_is_measured_where_the_set_begins(tmp_path):
+    """The slave's own group below has the same set, but not the processes that use the CPUs."""
+    write_proc(tmp_path, "0::/a.service/rosrm-agent\n", "/cg rw - cgroup2 cgroup2 rw")
+    (tmp_path / "proc/stat").write_text("cpu 1\n" + "".join(f"cpu{n} 1\n" for n in range(16)))
+    service = tmp_path / "cg/a.service"
+    for group, cpus in ((service, "0-3"), (service / "rosrm-agent", "0-3"), (tmp_path / "cg", "")):
+        group.mkdir(parents=True, exist_ok=True)
+        (group / "cpuset.cpus.effective").write_text(f"{cpus or '0-15'}\n")
+        (group / "cpu.stat").write_text("usage_usec 0\n")
+    clock = FakeClock()
+    gauge = CgroupCpu.find(1.0, tmp_path, clock)
+    assert gauge.capacity == 4.0
+    grow_cpu(service, 4.0)
+    clock.advance(1.0)
+    assert gauge.usage() == pytest.approx(1.0)
     gauge.close()
 
 
@@ -58,7 +97,7 @@ def test_least_room_above_counts_for_memory():
     """The tightest limit is the capacity; a fuller group above leaves only its own room."""
     gauge = CgroupMemory.find(TREES / "systemd")
     assert gauge.capacity == 3 * GIB  # memory.high of the service itself
-    assert gauge.usage() == pytest.approx(1 - (4096 - 3600) / 3072)  # room in robot.slice
+    assert gauge.usage() == pytest.approx(1 - (4096 - 1851) / 3072)  # room in robot.slice
     gauge.close()
 
 
@@ -141,6 +180,16 @@ def test_memory_of_version_1(tmp_path):
     gauge.close()
 
 
+def test_need_of_version_1_is_the_total_of_the_group(tmp_path):
+    """Anonymous and shared memory of the groups below count; the page cache does not."""
+    (tmp_path / "memory.usage_in_bytes").write_text("1000000\n")
+    stat = "rss 1\nshmem 1\ntotal_rss 400000\ntotal_shmem 200000\ntotal_active_file 400000\n"
+    (tmp_path / "memory.stat").write_text(stat)
+    gauge = CgroupMemory([(tmp_path, 2e6)], version=1)
+    assert gauge.usage() == pytest.approx(0.3)
+    gauge.close()
+
+
 def test_cpu_of_version_1(tmp_path):
     """Version 1 keeps quota and used time in two controllers, mounted at two places."""
     write_proc(
@@ -204,7 +253,7 @@ def test_another_group_is_measured_instead_of_the_own():
     """The option `group` counts that group and those above it, not the slave's own."""
     gauge = CgroupMemory.find(TREES / "systemd", "/robot.slice")
     assert gauge.capacity == 4 * GIB
-    assert gauge.usage() == pytest.approx(3600 / 4096)
+    assert gauge.usage() == pytest.approx(1851 / 4096)
     gauge.close()
 
 

@@ -52,3 +52,16 @@ def test_disk_is_what_psutil_reads(tmp_path):
     usage = psutil.disk_usage(str(tmp_path))
     assert gauge.usage() == pytest.approx(usage.percent / 100, abs=0.01)
     assert gauge.capacity == pytest.approx(usage.used + usage.free, rel=0.01)
+
+
+def test_the_cache_of_zfs_is_no_usage(tmp_path):
+    """ZFS gives its cache back down to its least size, and MemAvailable does not count it."""
+    (tmp_path / "meminfo").write_text("MemTotal: 16000 kB\nMemAvailable: 2000 kB\n")
+    stats = tmp_path / "spl/kstat/zfs/arcstats"
+    stats.parent.mkdir(parents=True)
+    stats.write_text(
+        "13 1 0x01 147 39984 5 9\nname type data\nc_min 4 1024000\nsize 4 9216000\nhits 4 5\n"
+    )
+    gauge = MachineMemory(tmp_path)
+    assert gauge.usage() == pytest.approx(1 - (2000 + 8000) / 16000)
+    gauge.close()

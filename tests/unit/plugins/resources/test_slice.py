@@ -35,6 +35,11 @@ class Tree:
             f"{pid} (a) b) S 1 {pid} {session} 0 -1 0 0 0 0 0 {ticks} 20 0 1 0 {started} 0 0\n"
         )
         (folder / "statm").write_text(f"9999 {pages} 10 1 0 50 0\n")
+        shared, own = pages // 10 * PAGE // 1024, (pages - pages // 10) * PAGE // 1024
+        (folder / "status").write_text(
+            f"Name:\ta\nVmRSS:\t999999 kB\nRssAnon:\t{own} kB\nRssFile:\t999 kB\n"
+            f"RssShmem:\t{shared} kB\n"
+        )
 
     def end(self, pid):
         # An open file must answer as in the kernel: with no content.
@@ -143,7 +148,7 @@ def test_orphan_that_ends_leaves_no_gap(tree):
 
 
 def test_memory_is_the_sum_of_the_known_processes(tree):
-    """Usage is the resident pages over the budget; ended processes do not count."""
+    """Usage is anonymous and shared memory over the budget, as `rosrm ps` shows it."""
     tree.put(10, 10, 0.0, pages=100)
     tree.put(11, 10, 0.0, pages=50)
     sessions = FakeSessions((10, 11, 12))
