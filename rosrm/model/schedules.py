@@ -6,8 +6,10 @@ Nothing here reads a clock. The rules of the time zones are those of the machine
 from __future__ import annotations
 
 import re
+import struct
 from dataclasses import dataclass, replace
 from datetime import date, datetime, time, timedelta, timezone, tzinfo
+from io import BytesIO
 from math import floor
 from typing import Final
 
@@ -21,7 +23,15 @@ MOST_TIMES: Final = 256
 WEEKDAYS: Final = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 #: Forms of a time of day, in messages.
 _EXAMPLES: Final = '"02:00" or "02:00 Europe/Berlin"'
-_TIME: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?: +([A-Za-z0-9_+/-]{1,64}))?")
+_TIME: Final = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)(?: +([A-Za-z0-9_+/<>.,:-]{1,64}))?")
+#: Rules of a zone as in the variable TZ: "CET-1CEST,M3.5.0,M10.5.0/3", "<+0330>-3:30".
+_ABBREVIATION: Final = r"(?:<[A-Za-z0-9+-]{3,}>|[A-Za-z]{3,})"
+_OFFSET: Final = r"[+-]?\d{1,3}(?::\d\d){0,2}"
+_RULES: Final = re.compile(
+    rf"{_ABBREVIATION}{_OFFSET}(?P<summer>{_ABBREVIATION}(?:{_OFFSET})?(?P<changes>,.+,.+)?)?"
+)
+#: Changes of a zone with summer time whose rules name none, as in the C library.
+_USUAL_CHANGES: Final = ",M3.2.0,M11.1.0"
 #: Days that are searched for the next run: a week, and a day more on each side for the zone.
 _DAYS: Final = range(-1, 9)
 _DAY: Final = 86400.0
@@ -147,8 +157,21 @@ def _zone(name: str) -> tzinfo:
         return timezone.utc
     try:
         return ZoneInfo(name)
-    except (KeyError, OSError) as fault:  # a directory of the database is an OSError
-        raise ValueError(f"unknown time zone {name!r}") from fault
+    except (KeyError, OSError, ValueError):  # a directory of the database is an OSError
+        return _by_rules(name)
+
+
+def _by_rules(text: str) -> tzinfo:
+    """Return the time zone with the rules of a text as in TZ; raises `ValueError`."""
+    from zoneinfo import ZoneInfo  # noqa: PLC0415 - only jobs with a schedule need it
+
+    found = _RULES.fullmatch(text)
+    if found is None:
+        raise ValueError(f"unknown time zone {text!r}")
+    rules = text + _USUAL_CHANGES if found["summer"] and not found["changes"] else text
+    # A file of the database without any past change, whose last line has the rules.
+    block = b"TZif2" + bytes(15) + struct.pack(">6L", 0, 0, 0, 0, 1, 4) + bytes(6) + b"UTC\0"
+    return ZoneInfo.from_file(BytesIO(2 * block + f"\n{rules}\n".encode()), key=text)
 
 
 def _zone_or_utc(name: str) -> tzinfo:
