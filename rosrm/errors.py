@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from itertools import takewhile
 from traceback import walk_stack, walk_tb
 from types import FrameType
-from typing import Final
+from typing import Final, NoReturn
 
 from rosrm.wording import sanitized
 
@@ -200,3 +200,8 @@ def _packages(frames: Iterable[tuple[FrameType, int]]) -> list[tuple[str, str]]:
 
 def _innermost(frames: list[tuple[str, str]], package: str) -> str:
     return next((place for name, place in reversed(frames) if name == package), "")
+
+
+def assert_never(value: NoReturn) -> NoReturn:
+    """Fail for a value that no branch handles; a type checker proves that there is none."""
+    raise AssertionError(f"{value!r} is handled by no branch")

@@ -261,6 +261,11 @@ class Amendment:
     restart: RestartPolicy
     limits: Limits | None = None
 
+    def after(self, former: Amendment | None) -> Amendment:
+        """Return the amendment that has the effect of a former one and of this one."""
+        kept = former.limits if former is not None and self.limits is None else self.limits
+        return Amendment(self.restart, kept)
+
 
 @dataclass(frozen=True, slots=True)
 class Realtime:

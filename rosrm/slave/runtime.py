@@ -561,25 +561,28 @@ class SlaveRuntime:
                 self._endpoint.publish_statuses(reported, complete=False)
 
     def _carry_out(self, command: commands.Command) -> None:
-        if isinstance(command, commands.Launch):
-            if not self._ending.keeps:  # the master expects no new start
-                self._starter.launch(command.assignments, command.slots)
-        elif isinstance(command, commands.Report):
-            self._endpoint.publish_statuses(command.statuses, complete=command.complete)
-        elif isinstance(command, commands.Settle):
-            for settled in self._unsettled.pop((command.instance, command.amendment), []):
-                settled(command.refusal, command.code)
-        elif isinstance(command, commands.SettleLifecycle):
-            for settled in self._unreached.pop((command.instance, command.goal), []):
-                settled(command.refusal, command.code)
-        elif isinstance(command, commands.ReadLifecycleState | commands.ChangeLifecycleState):
-            self._participant.guard.call(self._lifecycle_clients.send, command, clocks.boot_time())
-        elif isinstance(command, commands.ListComponents | commands.LoadComponent):
-            self._participant.guard.call(self._component_loads.send, command, clocks.boot_time())
-        else:
-            self._have_supervisor(command)
+        match command:
+            case commands.Launch(assignments, slots):
+                if not self._ending.keeps:  # the master expects no new start
+                    self._starter.launch(assignments, slots)
+            case commands.Report(statuses, complete):
+                self._endpoint.publish_statuses(statuses, complete=complete)
+            case commands.Settle(instance, amendment, refusal, code):
+                for settled in self._unsettled.pop((instance, amendment), []):
+                    settled(refusal, code)
+            case commands.SettleLifecycle(instance, goal, refusal, code):
+                for settled in self._unreached.pop((instance, goal), []):
+                    settled(refusal, code)
+            case commands.ReadLifecycleState() | commands.ChangeLifecycleState():
+                now = clocks.boot_time()
+                self._participant.guard.call(self._lifecycle_clients.send, command, now)
+            case commands.ListComponents() | commands.LoadComponent():
+                now = clocks.boot_time()
+                self._participant.guard.call(self._component_loads.send, command, now)
+            case _:
+                self._have_supervisor(command)
 
-    def _have_supervisor(self, command: commands.Command) -> None:
+    def _have_supervisor(self, command: commands.SupervisorCommand) -> None:
         """Send a command to the supervisor, unless the instance still waits for its start."""
         if self._starter.call_off(command):
             return

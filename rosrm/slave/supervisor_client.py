@@ -16,8 +16,8 @@ from rosrm.component.link import FAILED, fault_in
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
 from rosrm.core.supervisor import events as orders
-from rosrm.errors import SupervisorError
-from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+from rosrm.errors import SupervisorError, assert_never
+from rosrm.model.values import Amendment, InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
@@ -128,7 +128,7 @@ class SupervisorLink:
             self._client.start(launches)
         self._log_waits()
 
-    def carry_out(self, command: commands.Command) -> None:
+    def carry_out(self, command: commands.SupervisorCommand) -> None:
         """Send a command of the core."""
         if isinstance(command, commands.Stop | commands.Fence):
             self._unanswered.pop(command.instance, None)
@@ -281,25 +281,34 @@ class SupervisorLink:
         self._ended("" if orderly else f"the supervisor of this host is gone: {error}")
 
 
-def _order_of(command: commands.Command) -> messages.Order:
+def amended(order: LaunchOrder, amendment: Amendment) -> LaunchOrder:
+    """Return an order with the changes that the supervisor would make by `commands.Amend`."""
+    environment = {name: value for name, value in order.environment.items() if name != SHADOW}
+    limits = order.limits.with_limits(run_limits(amendment.limits))
+    return replace(order, restart=amendment.restart, limits=limits, environment=environment)
+
+
+def _order_of(command: commands.SupervisorCommand) -> messages.Order:
     """Return a command of the core as an order to the supervisor."""
+    order: messages.Order
     match command:
         case commands.Stop(instance):
-            return orders.StopOrdered(key_of(instance))
+            order = orders.StopOrdered(key_of(instance))
         case commands.Fence(instance):
-            return orders.FenceOrdered(key_of(instance))
+            order = orders.FenceOrdered(key_of(instance))
         case commands.Restart(instance):
-            return orders.RestartOrdered(key_of(instance))
+            order = orders.RestartOrdered(key_of(instance))
         case commands.Renew(at, alive):
-            return orders.ContactReported(at, alive)
+            order = orders.ContactReported(at, alive)
         case commands.Fail(instance, pid, reason, kill):
-            return orders.FailOrdered(key_of(instance), pid, reason, kill)
+            order = orders.FailOrdered(key_of(instance), pid, reason, kill)
         case commands.Amend(instance, amendment):
             restart, limits = restart_rule(amendment.restart), run_limits(amendment.limits)
-            return messages.Amend(key_of(instance), restart, {SHADOW: None}, limits)
+            order = messages.Amend(key_of(instance), restart, {SHADOW: None}, limits)
         case commands.Remember(instance, memo):
-            return messages.Remember(key_of(instance), to_memo(memo))
+            order = messages.Remember(key_of(instance), to_memo(memo))
         case commands.Forget(instances):
-            return messages.Forget(tuple(orders.StatusStored(key_of(one)) for one in instances))
+            order = messages.Forget(tuple(orders.StatusStored(key_of(one)) for one in instances))
         case _:
-            raise TypeError(command)
+            assert_never(command)
+    return order

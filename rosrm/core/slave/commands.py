@@ -196,8 +196,9 @@ class Report:
     complete: bool = False
 
 
+#: Commands that the supervisor executes, once it has the instance.
+SupervisorCommand = Stop | Fence | Renew | Restart | Fail | Amend | Remember | Forget
 Command = (
-    Launch | Stop | Fence | Renew | Restart | Fail | Amend | Settle | ReadLifecycleState
-    | ChangeLifecycleState | SettleLifecycle | ListComponents | LoadComponent | Remember | Forget
-    | Report
+    Launch | SupervisorCommand | Settle | ReadLifecycleState | ChangeLifecycleState
+    | SettleLifecycle | ListComponents | LoadComponent | Report
 )  # fmt: skip

@@ -261,6 +261,7 @@ def _amendment_ordered(state: SlaveState, event: events.AmendmentOrdered, now: f
     ]  # fmt: skip
     if held.status.state.ended:
         return settled
+    held.amended = amendment.after(held.amended)
     news = _pause_or_watch(held, amendment.restart)
     waiting = state.waiting.get(instance)
     if waiting is not None:  # the supervisor does not know the instance yet

@@ -80,7 +80,7 @@ class HeldInstance:
             in order.
         ended_at: time of its end, or of the report of the end to a newly registered master.
         began: start of its first run; None: it has not started.
-        amended: what the master has changed since the assignment; None: nothing.
+        amended: changes since the assignment, which a start must have; None: none.
         devices: devices that it holds.
         artifacts: artifacts that it uses.
         lifecycle: None: the slave does not change the lifecycle state of its node.

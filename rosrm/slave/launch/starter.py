@@ -16,7 +16,7 @@ from typing import Final
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.state import HeldInstance, SlaveState
-from rosrm.errors import LaunchError, describe_fault
+from rosrm.errors import LaunchError, assert_never, describe_fault
 from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
@@ -34,7 +34,7 @@ from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import to_memo
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sessions import SessionTable
-from rosrm.slave.supervisor_client import SupervisorLink
+from rosrm.slave.supervisor_client import SupervisorLink, amended
 from rosrm.supervisor.client_values import LaunchOrder
 from rosrm.supervisor.secret_files import is_exposed
 from rosrm.wording import one_line
@@ -159,23 +159,33 @@ class Starter:
             self._start(ready, slots)
         return ready
 
-    def call_off(self, command: commands.Command) -> bool:
-        """Apply a command to an instance that still waits for its artifacts or its snapshot.
+    def call_off(self, command: commands.SupervisorCommand) -> bool:
+        """Apply a command to an instance that the supervisor does not have yet.
 
-        Stop and fence cancel the start; a restart has no effect, because the start follows anyway.
-        Returns False if the supervisor has to execute the command: it is another one, or the
-        instance does not wait.
+        Such an instance waits for its artifacts, its snapshot or a path. Returns False if the
+        supervisor has to execute the command.
         """
-        if not isinstance(command, commands.Stop | commands.Fence | commands.Restart):
-            return False
-        if not self._is_preparing(command.instance):
-            return False
-        if not isinstance(command, commands.Restart):  # a restart needs nothing: the start follows
-            self.artifacts.forget(command.instance)
-            self.replication.forget(command.instance)
-            self._launching.pop(command.instance, None)
-            refusal = "it was stopped before it was started"
-            self.take(events.LaunchRefused(command.instance, refusal))
+        match command:
+            case commands.Renew() | commands.Forget():
+                return False  # of no instance that waits
+            case commands.Stop(instance) | commands.Fence(instance):
+                if not self._is_preparing(instance):
+                    return False
+                self.artifacts.forget(instance)
+                self.replication.forget(instance)
+                self._launching.pop(instance, None)
+                refusal = "it was stopped before it was started"
+                self.take(events.LaunchRefused(instance, refusal))
+            case commands.Amend(instance, amendment):
+                if not self._is_preparing(instance):
+                    return False
+                self.take(events.AmendmentRecorded(instance, amendment))  # `_completed` applies it
+            case commands.Restart(instance) | commands.Remember(instance):
+                return self._is_preparing(instance)  # the start follows, with the newest memo
+            case commands.Fail(instance):
+                return self._is_preparing(instance)  # no run of it can be meant
+            case _:
+                assert_never(command)
         return True
 
     def close(self) -> None:
@@ -304,8 +314,10 @@ class Starter:
             self.supervisor.start(orders)
 
     def _completed(self, order: LaunchOrder, slots: int) -> LaunchOrder:
-        memo = to_memo(self.state.held[order.instance].memo)
-        return replace(order, memo=memo, slots=slots, last_contact=self.state.last_contact)
+        held = self.state.held[order.instance]
+        order = order if held.amended is None else amended(order, held.amended)
+        contact = self.state.last_contact
+        return replace(order, memo=to_memo(held.memo), slots=slots, last_contact=contact)
 
     def _ordered(
         self, assignment: Assignment, slots: int, outcome: LaunchOrder | BaseException

@@ -64,7 +64,7 @@ class Slave:
         for spec in specs:
             one = Assignment(InstanceId(spec.name, 1), spec, epoch=1, node_name=spec.node)
             status = InstanceStatus(one.instance, InstanceState.STARTING)
-            held = SimpleNamespace(status=status, awaited=None, memo=None)
+            held = SimpleNamespace(status=status, awaited=None, memo=None, amended=None)
             self.state.held[one.instance] = held
             assignments.append(one)
         self.starter.launch(assignments)

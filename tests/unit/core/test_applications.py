@@ -10,6 +10,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Reply
+from rosrm.core.slave import events as slave_events
 from rosrm.model.applications import Action, ApplicationRow, Target
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import AmendInstance, StartInstance
@@ -1010,3 +1011,32 @@ def test_a_plan_writes_no_history() -> None:
     before = list(cluster["p"].history)
     cluster.apply("nav", new(process("p")), plan=True)
     assert cluster["p"].history == before
+
+
+class Fetching(Machine):
+    """A host on which a start waits for artifacts until the test lets it begin."""
+
+    def _launch(self, assignment, now: float) -> None:
+        self.fetches = assignment
+        self.tell(slave_events.StartDelayed(assignment.instance, "fetches artifacts"), now)
+
+    def arrive(self, now: float) -> None:
+        super()._launch(self.fetches, now)
+
+
+@pytest.mark.parametrize("hosts", ["a", "ab"])
+def test_a_change_in_place_reaches_a_start_that_waits_for_files(hosts) -> None:
+    """The fetch goes on where it is, and the process starts with the new policy."""
+    cluster = Cluster(*(Fetching(host) for host in hosts))
+    cluster.apply("app", process("p"))
+    (instance,) = cluster["p"].instances
+    cluster.apply("app", process("p", restart=RestartPolicy("on-failure")))
+    cluster.wait(2.0)
+    assert cluster["p"].instances == {instance}
+    assert not cluster["p"].excluded
+    assert not cluster.state.unamended
+    machine = next(one for one in cluster.machines.values() if hasattr(one, "fetches"))
+    machine.arrive(cluster.now)
+    cluster.wait(1.0)
+    (program,) = machine.programs.values()
+    assert (cluster.phase("p"), program.restart.when) == ("running", "on-failure")

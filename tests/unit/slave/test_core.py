@@ -402,6 +402,14 @@ def test_an_amendment_of_a_held_instance(running) -> None:
     assert not started.shadow
 
 
+def test_an_amendment_is_kept_for_a_start_that_still_waits_for_files(running) -> None:
+    """The runtime starts the instance with it; a later one without limits keeps the limits."""
+    limited = replace(ON_FAILURE, limits=Limits(memory=2e9))
+    running.step(AmendmentOrdered(ONE, limited))
+    running.step(AmendmentOrdered(ONE, NEVER))
+    assert running.state.held[ONE].amended == replace(NEVER, limits=Limits(memory=2e9))
+
+
 def test_limits_that_change_while_an_instance_runs_are_reported(running) -> None:
     """The instance stays ready, and the master learns which limits hold now."""
     running.status(STATE.RUNNING, pid=7)

@@ -24,6 +24,7 @@ from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.lifecycle_nodes import STATE_AFTER
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
+from rosrm.errors import assert_never
 from rosrm.model.devices import Device
 from rosrm.model.orders import (
     AmendInstance,
@@ -265,6 +266,18 @@ class Host(ABC, Generic[ProgramT]):
             case commands.Launch(assignments):
                 for assignment in assignments:
                     self._launch(assignment, now)
+            case commands.Settle() | commands.SettleLifecycle():
+                self._settled.append(command)
+            case commands.ReadLifecycleState() | commands.ChangeLifecycleState():
+                self.tell(self._answer_of_node(command), now)
+            case commands.ListComponents() | commands.LoadComponent():
+                pass  # here no container loads components
+            case _:
+                self._supervise(command, now)
+
+    def _supervise(self, command: commands.SupervisorCommand, now: float) -> None:
+        """Carry out a command of the slave as its supervisor does."""
+        match command:
             case commands.Stop(instance):
                 self._stop(instance, now)
             case commands.Fence(instance):
@@ -272,15 +285,16 @@ class Host(ABC, Generic[ProgramT]):
             case commands.Restart(instance):
                 self._restart(instance, now)
             case commands.Amend(instance, amendment):
-                refusal = self._amend(self.programs[instance], amendment)
+                program = self.programs.get(instance)  # None: its start has the amendment
+                refusal = "" if program is None else self._amend(program, amendment)
                 self.tell(events.AmendmentRecorded(instance, amendment, refusal), now)
-            case commands.Settle() | commands.SettleLifecycle():
-                self._settled.append(command)
-            case commands.ReadLifecycleState() | commands.ChangeLifecycleState():
-                self.tell(self._answer_of_node(command), now)
             case commands.Forget(instances):
                 for instance in instances:
                     self.ends.pop(instance, None)
+            case commands.Renew() | commands.Remember() | commands.Fail():
+                pass  # here no slave is cut off from its master, restarted or observed
+            case _:
+                assert_never(command)
 
     def _answer_of_node(
         self, request: commands.ReadLifecycleState | commands.ChangeLifecycleState
@@ -346,7 +360,10 @@ class Host(ABC, Generic[ProgramT]):
         silent = assignment.shadow or assignment.restored
         restart = RestartPolicy() if silent else assignment.spec.restart
         instance = assignment.instance
-        self.programs[instance] = self.make_program(assignment, restart)
+        program = self.programs[instance] = self.make_program(assignment, restart)
+        held = self.slave.held.get(instance)
+        if held is not None and held.amended is not None:
+            self._amend(program, held.amended)
         self.later(self.start_time, now, partial(self._started, instance, 0))
 
     def _started(self, instance: InstanceId, run: int, now: float) -> None:
