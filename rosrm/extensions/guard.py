@@ -6,15 +6,16 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Final, Protocol, TypeVar
+from typing import Final, NamedTuple, Protocol, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
-from rosrm.extensions.plugin_calls import Answers, contained
+from rosrm.extensions.plugin_calls import Answers, Plugin, contained, titled
 from rosrm.extensions.process_state import Interrupts, ProcessState
-from rosrm.extensions.time_limit import limited
+from rosrm.extensions.time_limit import CALL_LIMIT, limited
 from rosrm.wording import listed
 
 T = TypeVar("T")
@@ -24,11 +25,23 @@ T = TypeVar("T")
 LOADING_LIMIT: Final = 8.0
 
 
+class Crash(NamedTuple):
+    """A call in which a former process ended.
+
+    Attributes:
+        whom: the plugin, as "probe 'x'".
+        text: a sentence on the end.
+    """
+
+    whom: str
+    text: str
+
+
 class Notes(Protocol):
     """Notes of the running calls; a part keeps them in a file (`rosrm.runtime.crash_notes`)."""
 
-    def reason(self, whom: str) -> str:
-        """Return why a plugin is left out; "": it is not."""
+    def reason(self, whom: str, hook: str) -> str:
+        """Return why a plugin's method is not called; "": it is."""
 
     def begin(self, whom: str, hook: str) -> int:
         """Note a call that begins; return its slot, 0 for none."""
@@ -84,12 +97,18 @@ def guarded(
         raise PluginError(describe_plugin_fault(fault)) from fault
 
 
+def limit_of_one_call(plugin: Plugin, call: Callable[[], T]) -> T:
+    """Execute a call for `PluginCalls` with a time-out; master and slave set `Deadlines`."""
+    late = f"it took longer than {CALL_LIMIT:g} s"
+    return limited(CALL_LIMIT, partial(in_process, titled(*plugin), "", call), lambda: late)
+
+
 def in_process(whom: str, hook: str, call: Callable[[], T]) -> T:
     """Call a plugin; note whom, and restore what it changed in the process."""
-    left_out = "" if _notes is None else _notes.reason(whom)
+    left_out = "" if _notes is None else _notes.reason(whom, hook)
     if left_out:
         raise PluginError(left_out)
-    slot = 0 if _notes is None else _notes.begin(whom, hook)
+    slot, pid = 0 if _notes is None else _notes.begin(whom, hook), os.getpid()
     try:
         if threading.current_thread() is not threading.main_thread():
             return _without_interrupt(call)
@@ -106,6 +125,10 @@ def in_process(whom: str, hook: str, call: Callable[[], T]) -> T:
             if changed:
                 _log.warning("%s: %s has changed %s, restored now", whom, hook, listed(changed))
     finally:
+        if (
+            os.getpid() != pid
+        ):  # a fork of the plugin, which would go on as a second master or slave
+            os._exit(1)
         if _notes is not None:
             _notes.end(slot)
 

@@ -6,6 +6,7 @@ checked options; `rosrm.config.options` checks the options in a file against the
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache, partial
@@ -44,7 +45,7 @@ from rosrm.extensions.discovery import (
     load_addresses,
     load_objects,
 )
-from rosrm.extensions.guard import guarded, note_versions
+from rosrm.extensions.guard import Crash, guarded, limit_of_one_call, note_versions
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.extensions.made import (
     MadeLauncher,
@@ -93,6 +94,8 @@ _MOST_BROKEN: Final = 3
 
 _NO_CAPABILITIES: Final = Capabilities()
 
+_log = logging.getLogger("rosrm.plugins")
+
 NameToOptions = Mapping[str, Mapping[str, Any]]
 T = TypeVar("T")
 
@@ -108,7 +111,7 @@ class Registry:
         self._offers: dict[Plugin, Offered] = {}
         self._broken: list[Broken] = list(loaded.broken)
         self._outcome: dict[Plugin, tuple[PluginState, str]] = {}
-        self.calls = PluginCalls()
+        self.calls = PluginCalls(limit_of_one_call)
         self._keep_single(loaded.offers)
         note_versions({
             titled(*key): offered.source.distribution for key, offered in self._offers.items()
@@ -138,6 +141,14 @@ class Registry:
     def of(cls, **plugins: object) -> Registry:
         """Return a registry of modules or objects, without an installation (for tests)."""
         return cls(load_objects(plugins))
+
+    def note_crashes(self, crashes: Iterable[Crash]) -> None:
+        """Log and record in which calls of plugins a former process has ended."""
+        known = {titled(*key): key for key in self._offers}
+        for crash in crashes:
+            _log.warning("%s: %s", crash.whom, crash.text)
+            if crash.whom in known:
+                self.calls.note(known[crash.whom], crash.text)
 
     # --- offers -------------------------------------------------------------------------------
 

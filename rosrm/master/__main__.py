@@ -13,25 +13,28 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 gc.disable()  # a fifth of the start's CPU time; see `bootstrap.end_start`
 
 import os
-import sys
 
 from rosrm.config.settings import ClusterConfig
+from rosrm.ros.own_signals import own_signals
 from rosrm.ros.participant import Participant
 from rosrm.ros.peer_announcements import request_announcements
-from rosrm.runtime.bootstrap import Handover, run
+from rosrm.runtime.bootstrap import Handover, end_process, run
+from rosrm.runtime.crash_notes import kept_notes
 
 
 def serve(handover: Handover) -> int:
     """Join ROS and run the master; return the exit code."""
     config = ClusterConfig.from_json(handover.settings)
+    own_signals()
     with Participant(config.ros, "rosrm_master") as participant:
         if not config.ros.interface_in_force():  # the request would leave by all interfaces
             request_announcements(participant.context.get_domain_id(), os.environ)
         # Imported only here, so that DDS discovers other participants during the imports.
         from rosrm.master.assembly import new_runtime  # noqa: PLC0415
 
-        return new_runtime(config, handover, participant).run()
+        with kept_notes(config.state) as notes:
+            return new_runtime(config, handover, participant, notes.found).run()
 
 
 if __name__ == "__main__":
-    sys.exit(run("master", serve))
+    end_process(run("master", serve))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
 from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
+from rosrm.extensions.guard import Crash
 from rosrm.extensions.registry import MASTER_KINDS, Registry
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
@@ -16,10 +18,16 @@ from rosrm.runtime.bootstrap import Handover
 
 
 def new_runtime(
-    config: ClusterConfig, handover: Handover, participant: Participant
-) -> MasterRuntime:
-    """Create the configured plugins, and return a master with them."""
+    config: ClusterConfig, handover: Handover, participant: Participant,
+    crashes: Sequence[Crash] = (),
+) -> MasterRuntime:  # fmt: skip
+    """Create the configured plugins, and return a master with them.
+
+    Args:
+        crashes: calls of plugins in which former masters have ended.
+    """
     registry = Registry.load(handover.plugins, MASTER_KINDS)
+    registry.note_crashes(crashes)
     placement = placement_of(config, registry)
     strategies = registry.migrations(config.migration.strategies)
     checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)

@@ -38,6 +38,7 @@ from rosrm.extensions.contracts import CheckpointPolicy, MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import PlacementPlugins
 from rosrm.extensions.plugin_deadline import Deadlines
+from rosrm.extensions.process_state import ProcessState
 from rosrm.extensions.time_limit import CALL_LIMIT
 from rosrm.journal.errors import unreadable
 from rosrm.journal.sqlite import SqliteJournal
@@ -320,6 +321,7 @@ class MasterRuntime:
     def run(self) -> int:
         """Serve until a signal to stop; returns the exit code."""
         end_start()
+        self._process = ProcessState()
         next_tick = next_beat = self._now()
         with self._closing:
             while not self._stopping:
@@ -364,6 +366,7 @@ class MasterRuntime:
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _tick(self, now: float) -> None:
+        self._process.restore()  # of what a plugin has changed in a thread
         self._endpoint.events += self._reload.poll()
         if self._grants.has_changed(now):
             self._endpoint.shut_revoked()

@@ -161,6 +161,10 @@ def fields_from_plain(
     return _read_fields(shape, given, shape.required.intersection(names))
 
 
+#: Most bytes of a value of a plugin as JSON: of a plan, or a step.
+LONGEST_OF_PLUGIN: Final = 1 << 19
+
+
 def checked(value: T, what: str) -> T:
     """Return a plugin's value after a round trip through JSON, as the journal restores it.
 
@@ -172,7 +176,12 @@ def checked(value: T, what: str) -> T:
         PluginError: a field has the wrong type, or is not valid JSON.
     """
     try:
-        return from_plain(type(value), json.loads(json.dumps(to_plain(value))))
+        text = json.dumps(to_plain(value), allow_nan=False)
+        if len(text) > LONGEST_OF_PLUGIN:
+            raise PluginError(
+                f"an unsound {what}: {len(text)} bytes as JSON; allowed: {LONGEST_OF_PLUGIN}"
+            )
+        return from_plain(type(value), json.loads(text))
     except (ValueError, TypeError) as fault:
         raise PluginError(f"an unsound {what}: {fault}") from fault
 

@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 from rosrm.errors import Refused
 from rosrm.model.remembered import remembered
 from rosrm.ros import sealed_codec
+from rosrm.wording import sendable
 from rosrm_msgs import msg
 
 #: Most letters of a text, and most entries of a sequence.
@@ -25,6 +26,9 @@ LARGEST_MESSAGE: Final = 1 << 26
 LARGEST_SPEC: Final = 1 << 20
 #: Most letters and entries of a nested message whose size is cached.
 _MOST_CACHED: Final = 512
+
+#: Facts of an event that exceed their bound.
+_CUT: Final = '{"cut": true}'
 
 _OTHER_LETTERS: Final = {
     "Sealed.principal": sealed_codec.MOST_LETTERS,
@@ -148,6 +152,28 @@ def check_bounds(message: Any) -> int:
     if size > LARGEST_MESSAGE:
         raise Refused(f"a {type(message).__name__} of {size} letters; at most {LARGEST_MESSAGE}")
     return size
+
+
+def fitted(row: Any) -> Any:
+    """Return a row of a listing with each text and sequence cut to its bound.
+
+    Otherwise one row with a longer text, or with one that is no UTF-8, refuses the whole listing.
+    """
+    for field, slot, entries, letters, nested in bounds_of(type(row)):
+        value = getattr(row, slot)
+        if entries and len(value) > entries:
+            setattr(row, slot, value[:entries])
+        if letters and not entries:
+            if len(value) > letters or not value.isascii():
+                cut = sendable(value[:letters])
+                whole = len(value) <= letters or field != "data"  # JSON that was cut is none
+                setattr(row, slot, cut if whole else _CUT)
+        elif letters:
+            setattr(row, slot, [sendable(text[:letters]) for text in getattr(row, slot)])
+        elif nested:
+            for one in getattr(row, slot) if entries else (value,):
+                fitted(one)
+    return row
 
 
 def _size(message: Any) -> int:

@@ -26,10 +26,12 @@ import mmap
 import os
 import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
+from rosrm.extensions import guard
+from rosrm.extensions.guard import Crash
 from rosrm.runtime.private_files import make_private_directory, open_private
 
 #: Weight from which on a plugin is left out.
@@ -42,20 +44,6 @@ _EMPTY: Final = bytes(_SLOT)
 _EXITED: Final = b"!"
 _CRASHED: Final = re.compile(rb"Current thread 0x([0-9a-f]+)")
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
-
-
-class Crash(NamedTuple):
-    """A call in which a former process ended.
-
-    Attributes:
-        whom: the plugin, as "probe 'x'".
-        text: a sentence on the end.
-        is_left_out: True: the plugin is not called any more.
-    """
-
-    whom: str
-    text: str
-    is_left_out: bool
 
 
 class CrashNotes:
@@ -88,24 +76,24 @@ class CrashNotes:
     def note_versions(self, versions: Mapping[str, str]) -> None:
         """Note the distribution of each plugin, because a new version is tried again."""
         before = json.dumps(self._known)
-        for whom, distribution in versions.items():
-            known = self._known.get(whom)
-            if known is None or known["version"] == distribution:
+        for key, known in list(self._known.items()):
+            version = versions.get(key.partition("\t")[0])
+            if version is None or known["version"] == version:
                 continue
             if known["version"] is None:  # of the crash that this start has found
-                known["version"] = distribution
+                known["version"] = version
             else:
-                del self._known[whom]
+                del self._known[key]
         if json.dumps(self._known) != before:
             self._write()
 
-    def reason(self, whom: str) -> str:
-        """Return why a plugin is left out; "": it is not."""
-        known = self._known.get(whom)
+    def reason(self, whom: str, hook: str) -> str:
+        """Return why a plugin's method is not called; "": it is."""
+        known = self._known.get(_key(whom, hook))
         if known is None or known["weight"] < LEFT_OUT:
             return ""
         return (
-            f"{known['text']}, repeatedly; it is left out until its version changes or "
+            f"{known['text']} repeatedly, so it is not called until its version changes or "
             f"{self._weights} is removed"
         )
 
@@ -180,10 +168,10 @@ class CrashNotes:
     def _blame(self, slot: bytes, how: str) -> Crash:
         words = slot.strip(b"!\0").decode(errors="replace").split("\t")
         whom, hook = (*words[1:], "", "")[:2]
-        text = f"the process ended{how and f' {how}'} in its {hook or 'code'}"
-        known = self._known.setdefault(whom, {"weight": 0, "version": None})
+        text = f"this process ended{how and f' {how}'} in {hook or 'a call'}"
+        known = self._known.setdefault(_key(whom, hook), {"weight": 0, "version": None})
         known["text"], known["weight"] = text, known["weight"] + (2 if how else 1)
-        return Crash(whom, text, known["weight"] >= LEFT_OUT)
+        return Crash(whom, text)
 
     def _write(self) -> None:
         with contextlib.suppress(OSError):  # a full disk: only the memory of this crash is lost
@@ -191,6 +179,10 @@ class CrashNotes:
             descriptor = open_private(str(self._weights), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             with os.fdopen(descriptor, "wb") as file:
                 file.write(text)
+
+
+def _key(whom: str, hook: str) -> str:
+    return f"{whom}\t{hook}"
 
 
 def _thread(slot: bytes) -> bytes:
@@ -219,3 +211,15 @@ def _boot() -> bytes:
         return _BOOT_ID.read_bytes().strip()
     except OSError:
         return b""
+
+
+@contextlib.contextmanager
+def kept_notes(directory: Path) -> Iterator[CrashNotes]:
+    """Keep notes of the calls of plugins in a state directory; remove them at an orderly end."""
+    notes = CrashNotes(directory)
+    guard.keep_notes(notes)
+    try:
+        yield notes
+    finally:
+        guard.keep_notes(None)
+        notes.close()

@@ -13,12 +13,13 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)
 gc.disable()  # a fifth of the start's CPU time; see `bootstrap.end_start`
 
 import logging
-import sys
 
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import SLAVE_KINDS, Registry
+from rosrm.ros.own_signals import own_signals
 from rosrm.runtime import cgroups, oom_score
-from rosrm.runtime.bootstrap import Handover, run
+from rosrm.runtime.bootstrap import Handover, end_process, run
+from rosrm.runtime.crash_notes import kept_notes
 from rosrm.slave.own_key import wait_for_security
 from rosrm.slave.runtime import SlaveRuntime
 
@@ -28,7 +29,7 @@ _log = logging.getLogger("rosrm.slave")
 def serve(handover: Handover) -> int:
     """Load the plugins and run the slave; return the exit code."""
     config = HostConfig.from_json(handover.settings)
-    registry = Registry.load(handover.plugins, SLAVE_KINDS)
+    own_signals()
     fault = oom_score.protect()
     if fault:
         _log.info(
@@ -37,8 +38,11 @@ def serve(handover: Handover) -> int:
             fault, oom_score.PROTECTED,
         )  # fmt: skip
     cgroups.delegate()  # first, because the supervisor inherits the group
-    return SlaveRuntime(config, registry, wait_for_security(config), handover.source).run()
+    with kept_notes(config.state) as notes:
+        registry = Registry.load(handover.plugins, SLAVE_KINDS)
+        registry.note_crashes(notes.found)
+        return SlaveRuntime(config, registry, wait_for_security(config), handover.source).run()
 
 
 if __name__ == "__main__":
-    sys.exit(run("slave", serve))
+    end_process(run("slave", serve))

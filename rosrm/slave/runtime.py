@@ -28,6 +28,7 @@ from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.plugin_deadline import Deadlines
+from rosrm.extensions.process_state import ProcessState
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
@@ -356,6 +357,7 @@ class SlaveRuntime:
         end_start()
         now = clocks.boot_time()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
+        process = ProcessState()
         next_sample = next_usage = next_graph = next_health = next_devices = now
         logged_at = now - _LOG_PERIOD
         while condition():
@@ -367,6 +369,7 @@ class SlaveRuntime:
                 self._clients.expire(now)
                 guard.call(self._usage.look, now, self._sampler.by_process)
                 guard.call(self._note_calls, now)
+                guard.call(process.restore)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:

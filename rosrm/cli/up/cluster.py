@@ -22,6 +22,9 @@ from rosrm.testing.local_cluster import LocalCluster, Part
 _REGISTER: Final = 30.0
 #: Seconds for the master to end after SIGINT, when no slave is left.
 _END: Final = 10.0
+#: Seconds for the end of a slave, which stops its processes first. A slave that a plugin holds is
+#: killed then, and the end of its supervisor ends the processes.
+_LONGEST_END: Final = 120.0
 #: Lines of a log that an error shows.
 _LINES: Final = 10
 
@@ -76,7 +79,11 @@ class UpCluster(LocalCluster):
         for part in self.slaves.values():
             part.end()
         for part in self.slaves.values():
-            part.process.wait()
+            try:
+                part.process.wait(_LONGEST_END)
+            except subprocess.TimeoutExpired:  # held by a plugin; the supervisor is stopped below
+                part.end(signal.SIGKILL)
+                part.process.wait()
         cleaner.stop_supervisors(self.directory)
         if self.master is not None:
             self.master.end()

@@ -23,6 +23,7 @@ from rosrm.model.rows import Listing
 from rosrm.model.traced_values import stamped_spec
 from rosrm.model.values import ProcessSpec
 from rosrm.ros import convert, names
+from rosrm.ros.bounds import fitted
 from rosrm.ros.control import (
     ControlServer,
     Handle,
@@ -450,12 +451,12 @@ class MasterServices:
                 answer=accepted(epoch=self._identity.epoch), master=view.master,
                 uptime=view.uptime, last_sequence=view.last_sequence, trouble=view.trouble,
                 security=self._endpoints.security.described, strangers=self._strangers(),
-                host_list=[convert.host_row_to_msg(row) for row in view.hosts],
-                process_list=[convert.process_row_to_msg(row) for row in view.processes],
-                plugin_list=[convert.plugin_row_to_msg(row) for row in view.plugins],
+                host_list=[fitted(convert.host_row_to_msg(row)) for row in view.hosts],
+                process_list=[fitted(convert.process_row_to_msg(row)) for row in view.processes],
+                plugin_list=[fitted(convert.plugin_row_to_msg(row)) for row in view.plugins],
                 application_list=json.dumps(to_plain(tuple(view.applications))),
                 mode_list=json.dumps(to_plain(tuple(view.modes))),
-                event_list=[convert.event_to_msg(row) for row in view.events],
+                event_list=[fitted(convert.event_to_msg(row)) for row in view.events],
             )
         )  # fmt: skip
 

@@ -1,0 +1,23 @@
+"""Signals of a part of rosrm, which a plugin must not give to rclpy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import rclpy
+
+
+def own_signals() -> None:
+    """Keep `rclpy.init` of a plugin from installing handlers of SIGINT and SIGTERM.
+
+    They would shut down all contexts of this process at a signal, also those of rosrm, which could
+    then neither stop its processes nor say that it ends. Call this in a master and a slave alone:
+    elsewhere the process is the user's.
+    """
+    found: Any = rclpy
+    found.install_signal_handlers = found.uninstall_signal_handlers = _nothing
+    found.signals.install_signal_handlers = found.signals.uninstall_signal_handlers = _nothing
+
+
+def _nothing(*_: object) -> None:
+    """Do nothing."""
