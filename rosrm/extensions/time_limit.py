@@ -203,8 +203,8 @@ class _Watch:
 
     @classmethod
     def _watch(cls) -> None:
-        while True:
-            time.sleep(_WATCH_PERIOD)
+        tick = threading.Event()
+        while not tick.wait(_WATCH_PERIOD):
             alarm = _Alarm.ringing
             if alarm is None or clocks.awake_time() < alarm.deadline + _WATCH_PERIOD:
                 continue

@@ -340,6 +340,7 @@ class MasterRuntime:
                 if self._diagnostics is not None:
                     self._diagnostics.advance(now, self._core_now(now), self._trouble())
                 self._endpoint.load.note_turn(self._now() - now)
+            self._process.restore()  # so that the log has the end
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
 

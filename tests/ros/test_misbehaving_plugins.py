@@ -54,16 +54,22 @@ class Launcher:
     def __init__(self, act): self.act = act
     def prepare(self, launch): return self.act(launch)
 class Tree(Launcher):
-    def __init__(self, act): self.say = act
-    def prepare(self, launch): return launch
-    def leads(self, leader): return True
+    def __init__(self, name, act): self.name, self.say = name, act
+    def prepare(self, launch):
+        return replace(launch, environment={**launch.environment, "TREE": self.name})
+    def leads(self, leader):
+        with open(f"/proc/{leader}/environ") as file:
+            return f"TREE={self.name}\0" in file.read()
     def members(self, leader): return self.say()
     def root(self, leader): return self.say()
 
 @hookimpl
 def register_launchers():
     own = [LauncherOffer(name, lambda c, act=act: Launcher(act)) for name, act in ACTS.items()]
-    return own + [LauncherOffer(name, lambda c, act=act: Tree(act)) for name, act in TREES.items()]
+    return own + [
+        LauncherOffer(name, lambda c, name=name, act=act: Tree(name, act))
+        for name, act in TREES.items()
+    ]
 
 class Strategy:
     def propose(self, move): raise ValueError("no")
@@ -287,4 +293,5 @@ def test_a_plugin_that_ends_the_master_is_named_and_then_left_out(
         cluster.reconnect()
     wait_until(lambda: ("filter", name) in failing(cluster), "the filter is listed")
     assert f"filter {name!r}: this process ended" in cluster.log_of("master")
+    cluster.wait("innocent", "running")
     assert cluster.process("innocent").pid == pid

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from rosrm.cli.options import pairs_of
 from rosrm.config.checking import near
 from rosrm.config.settings import HostConfig
-from rosrm.errors import ConfigError
+from rosrm.errors import ConfigError, PluginError
 from rosrm.extensions.contracts import ProbeContext
+from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import close_quietly
+from rosrm.extensions.plugin_calls import titled
 from rosrm.extensions.registry import Registry
 from rosrm.extensions.units import amount_of
+from rosrm.slave.probe_reads import read_values
 from rosrm.slave.sessions import SessionTable
 
 #: Resources of a slice, and True where other programs keep what they use now. A CPU is different:
@@ -21,6 +25,8 @@ from rosrm.slave.sessions import SessionTable
 _DIVIDED: Final[Mapping[str, bool]] = {"memory": True, "cpu": False, "disk": True}
 #: Label with the name of the host, so that a process can require one host.
 _LABEL: Final = "host"
+#: Least seconds for the first read of a probe.
+_READ: Final = 5.0
 
 
 def slices(
@@ -79,9 +85,16 @@ def _free(
     for one in registry.probes(probes, context).made:
         try:
             capacity = {resource.name: resource.capacity for resource in one.resources}
-            for reading in one.probe.read():
-                kept = reading.usage if _DIVIDED.get(reading.resource) else 0.0
-                free[reading.resource] = capacity[reading.resource] * (1.0 - kept)
+            used = guarded(
+                partial(read_values, one.probe, tuple(capacity)),
+                whom=titled("probe", one.name), hook="read", seconds=max(one.deadline, _READ),
+            )  # fmt: skip
+            for name, usage in zip(capacity, used, strict=True):
+                kept = usage if _DIVIDED.get(name) else 0.0
+                free[name] = capacity[name] * (1.0 - kept)
+        except PluginError:
+            if _DIVIDED.keys() & {resource.name for resource in one.resources}:
+                raise
         finally:
             close_quietly(one.probe)
     return {name: amount for name, amount in free.items() if name in _DIVIDED}

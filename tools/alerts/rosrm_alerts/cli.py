@@ -21,6 +21,9 @@ from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.wording import counted, listed
 
+#: Seconds for the delivery of one notice by `try`.
+_PATIENCE = 60.0
+
 if TYPE_CHECKING:
     from rosrm.extensions.registry import Registry
     from rosrm.extensions.sinks import EventSink
@@ -65,7 +68,10 @@ def try_sink(
 ) -> None:
     """Send one notice to a sink, to see that it arrives."""
     from rosrm import Notice
+    from rosrm.extensions.guard import guarded
+    from rosrm.extensions.plugin_calls import titled
     from rosrm.extensions.registry import Registry
+    from rosrm.extensions.sinks import NoticesRefused
     from rosrm_alerts.alerts_file import load_alerts
 
     registry = Registry.discover()
@@ -75,7 +81,10 @@ def try_sink(
     now = clocks.wall_time()
     notice = Notice(f"try-{now:.6f}", now, "try", "`rosrm alerts try` sent this notice")
     with closing(_made(chosen[sink], registry)) as made:
-        made.send([notice])
+        guarded(
+            lambda: made.send([notice]), whom=titled("sink", sink), hook="send", seconds=_PATIENCE,
+            lets=(NoticesRefused,),
+        )  # fmt: skip
     echo(f"the sink {sink} has taken the notice")
 
 

@@ -75,9 +75,12 @@ class Delivery:
     def _deliver(self) -> bool:
         """Deliver all that waits; return False if an attempt failed."""
         while waiting := self._outbox.waiting(self._name, self._batch):
-            send = partial(self._sink.send, [one.notice for one in waiting])
+            notices = [one.notice for one in waiting]
             try:
-                guarded(send, whom=titled("sink", self._name), hook="send", lets=(NoticesRefused,))
+                guarded(
+                    partial(self._sink.send, notices), whom=titled("sink", self._name),
+                    hook="send", lets=(NoticesRefused,),
+                )  # fmt: skip
             except NoticesRefused as refusal:
                 many = counted(len(waiting), "notice")
                 _log.error("sink %s: %s dropped: %s", self._name, many, refusal)
