@@ -29,12 +29,16 @@ class ProcessState:
 
     def __init__(self) -> None:
         root = logging.getLogger()
-        self._handlers = [signal.getsignal(number) for number in _SIGNALS]
+        self.keep_handlers()
         self._disabled, self._level = root.manager.disable, root.level
         self._log_handlers = root.handlers[:]
         self._directory = _directory()
         self._umask = os.umask(0o077)
         os.umask(self._umask)
+
+    def keep_handlers(self) -> None:
+        """Take the present handlers of signals for the state."""
+        self._handlers = [signal.getsignal(number) for number in _SIGNALS]
 
     def restore(self) -> list[str]:
         """Restore what has changed since; return what it was. No effect in another thread."""

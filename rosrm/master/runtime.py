@@ -132,6 +132,7 @@ class MasterRuntime:
         reload: SettingsReload,
     ) -> None:
         self._config = config
+        self._process = ProcessState()
         self._participant = participant
         self._reload = reload
         self._checkpoint = checkpoint
@@ -157,6 +158,7 @@ class MasterRuntime:
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._reload.hang_up)
+            self._process.keep_handlers()
             opened.callback(self._reload.close)
             security = master_security(config.security)
             self._endpoints = SealedEndpoints(participant, security)
@@ -321,7 +323,6 @@ class MasterRuntime:
     def run(self) -> int:
         """Serve until a signal to stop; returns the exit code."""
         end_start()
-        self._process = ProcessState()
         next_tick = next_beat = self._now()
         with self._closing:
             while not self._stopping:

@@ -205,6 +205,7 @@ class SlaveRuntime:
     ) -> Mapping[str, str]:
         """Start reading the probes; return the absent ones with the reasons."""
         config = self._config
+        self._process = ProcessState()  # before the first read, which may change it
         context = ProbeContext(config.scope, config.budget, config.state, sessions)
         probes = registry.probes(config.probes, context)
         self._sampler = Sampler(probes.made)
@@ -214,6 +215,7 @@ class SlaveRuntime:
         return probes.absent
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
+        self._process.keep_handlers()
         self._supervisor = SupervisorLink(
             self._config.state / "supervisor", self._config.logs, post=self._post, take=self._take,
             follow=self._follow_session,
@@ -357,7 +359,6 @@ class SlaveRuntime:
         end_start()
         now = clocks.boot_time()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
-        process = ProcessState()
         next_sample = next_usage = next_graph = next_health = next_devices = now
         logged_at = now - _LOG_PERIOD
         while condition():
@@ -369,7 +370,7 @@ class SlaveRuntime:
                 self._clients.expire(now)
                 guard.call(self._usage.look, now, self._sampler.by_process)
                 guard.call(self._note_calls, now)
-                guard.call(process.restore)
+                guard.call(self._process.restore)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
             if awaited and now >= next_graph:
@@ -398,7 +399,7 @@ class SlaveRuntime:
             guard.call(self._services.acknowledge_starts)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
-        process.restore()  # so that the log has the end
+        self._process.restore()  # so that the log has the end
 
     def _look_at_devices(self) -> None:
         """Report changes of the devices to the master, and lost ones to the core."""

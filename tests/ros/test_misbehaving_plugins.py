@@ -59,7 +59,7 @@ class Tree(Launcher):
         return replace(launch, environment={**launch.environment, "TREE": self.name})
     def leads(self, leader):
         with open(f"/proc/{leader}/environ") as file:
-            return f"TREE={self.name}\0" in file.read()
+            return f"TREE={self.name}" in file.read().split("\\0")
     def members(self, leader): return self.say()
     def root(self, leader): return self.say()
 
