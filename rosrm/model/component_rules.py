@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from rosrm.model.description_checks import is_namespace, is_node_name, node_name_fault
+from rosrm.model.parameters import parameter_fault
 from rosrm.model.values import ProcessSpec
 
 #: Module of a process that stands for a component.
@@ -39,6 +40,9 @@ def _faults(spec: ProcessSpec) -> Iterator[str]:
             yield f"components: {one.name!r:.250} has no plugin, such as my_robot::Detector"
         if not is_node_name(one.name):
             yield f"components: {node_name_fault(one.name)}"
+        for name, value in [*one.parameters.items(), *one.arguments.items()]:
+            if fault := parameter_fault(name, value):
+                yield f"components: {one.name}: {name}: {fault}"
         if one.namespace and not is_namespace(one.namespace):
             namespace = f"{one.namespace!r:.250}"
             yield f"components: {namespace} is not an absolute namespace such as '/robot1'"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, Final
@@ -12,6 +13,8 @@ from rosrm.model.values import ALL_NODES, ParameterSource
 SECTION: Final = "ros__parameters"
 _PATTERN: Final = re.compile(r"(/([A-Za-z_][A-Za-z0-9_]*|\*\*?))+")
 _LONGEST_PATTERN: Final = 255
+#: Characters at which ROS ends a text, or which no file can have.
+_UNPASSABLE: Final = re.compile("[\0\ud800-\udfff]")
 
 
 def pattern_fault(nodes: str) -> str:
@@ -19,6 +22,27 @@ def pattern_fault(nodes: str) -> str:
     if len(nodes) <= _LONGEST_PATTERN and _PATTERN.fullmatch(nodes):
         return ""
     return f"{nodes!r:.250} is no name or pattern of nodes, such as /robot/planner, /robot/* or /**"
+
+
+def parameter_fault(name: str, value: Any) -> str:
+    """Return why a ROS parameter cannot be given to a node; "" if it can."""
+    if not name or not name.isprintable():
+        return f"{name!r:.100} is no name of a parameter"
+    if value is None:
+        return "a value is required; ROS has no null"
+    if value in ([], ()):
+        return "an empty list has no type, so no node can be given one; leave the parameter out"
+    items = value if isinstance(value, (list, tuple)) else [value]
+    kinds = {type(item) for item in items}
+    if kinds - {bool, int, float, str}:
+        return "a list in ROS parameters has only booleans, numbers or text"
+    if any(isinstance(item, float) and not math.isfinite(item) for item in items):
+        return "a finite number is required"
+    if any(isinstance(item, int) and not -(2**63) <= item < 2**63 for item in items):
+        return "a whole number of 64 bits is required, -2**63 to 2**63 - 1"
+    if any(isinstance(item, str) and _UNPASSABLE.search(item) for item in items):
+        return "a text without the character NUL and without halves of pairs is required"
+    return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 
 def flattened(parameters: Mapping[str, Any], before: str = "") -> Iterator[tuple[str, Any]]:
