@@ -19,6 +19,12 @@ from rosrm.errors import ConfigError
 
 #: Highest number of values in one file; values behind an alias count at each use of the alias.
 MOST_VALUES: Final = 200_000
+#: Most bytes of a file: reading one of this size takes some seconds.
+_LARGEST: Final = 1 << 24
+#: Key whose mappings are merged into the one around it.
+_MERGE: Final = "<<"
+#: Beginning of the keys of a file that rosrm leaves to its users, such as for anchors.
+_EXTENSION: Final = "x-"
 #: Ends of the names of launch files of ROS 2 that are no YAML.
 _LAUNCH_FILES: Final = ("launch.py", "launch.xml")
 
@@ -183,9 +189,18 @@ def node_of(value: object, place: Place) -> Node:
 
 def _text(path: Path) -> str:
     try:
-        content = sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes()
+        if str(path) == "-":
+            content = sys.stdin.buffer.read(_LARGEST + 1)
+        else:
+            with path.open("rb") as file:
+                content = file.read(_LARGEST + 1)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    if len(content) > _LARGEST:
+        raise ConfigError(
+            f"{path}: it has more than {_LARGEST >> 20} MiB, and is probably another file. Divide "
+            "a larger one, or use `foreach` and `array` for similar processes"
+        )
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -210,6 +225,16 @@ class _Loader(yaml.SafeLoader):
     """YAML loader that composes nodes with marks by the core schema of YAML 1.2."""
 
     yaml_implicit_resolvers: dict[Any, Any] = {}  # noqa: RUF012 - PyYAML's own shape
+    _composed = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Return the next node; refuse a file of too many before it is read to its end."""
+        self._composed += 1
+        if self._composed > 2 * MOST_VALUES:  # keys are nodes as well
+            raise yaml.MarkedYAMLError(
+                problem=f"more than {MOST_VALUES} values", problem_mark=self.get_mark()
+            )
+        return super().compose_node(parent, index)
 
 
 _TAG: Final = "tag:yaml.org,2002:"
@@ -254,7 +279,8 @@ class _Builder:
     def build(self, root: yaml.Node) -> Node:
         node = self._node(root, None)
         self._problems.raise_any()
-        return node
+        own = {key: item for key, item in node.items.items() if not key.startswith(_EXTENSION)}
+        return Node(own, node.place) if own.keys() != node.items.keys() else node
 
     def _node(self, node: yaml.Node, key_place: Place | None) -> Node:
         place = self._place(node)
@@ -288,8 +314,12 @@ class _Builder:
 
     def _members(self, mapping: yaml.MappingNode) -> Iterator[tuple[str, Node]]:
         first: dict[str, Place] = {}
+        merged: list[yaml.Node] = []
         for key, item in mapping.value:
             place = self._place(key)
+            if isinstance(key, yaml.ScalarNode) and (key.value, key.style) == (_MERGE, None):
+                merged += item.value if isinstance(item, yaml.SequenceNode) else [item]
+                continue
             if not isinstance(key, yaml.ScalarNode) or key.tag != f"{_TAG}str":
                 text = repr(key.value) if isinstance(key, yaml.ScalarNode) else "this"
                 self._problems.add(
@@ -306,6 +336,17 @@ class _Builder:
                 continue
             first[key.value] = place
             yield key.value, self._node(item, place)
+        for base in merged:  # the first one that has a key counts, after the keys given here
+            place = self._place(base)
+            members = self._node(base, None)
+            if not isinstance(members.value, Mapping):
+                self._problems.add(
+                    place, f"{_MERGE}: a mapping is required, such as `{_MERGE}: *base`"
+                )
+            for name, node in members.items.items():
+                if name not in first:
+                    first[name] = node.key_place or node.place
+                    yield name, node
 
     def _place(self, node: yaml.Node) -> Place:
         return Place(self._file, node.start_mark.line + 1, node.start_mark.column + 1)

@@ -94,3 +94,34 @@ def test_what_cannot_be_read_as_a_file_is_refused_by_name(tmp_path):
     (tmp_path / "latin.yaml").write_bytes(b"a: 1\nb: caf\xe9\n")
     with pytest.raises(ConfigError, match=r"latin.yaml:2:7: not UTF-8 text"):
         read(tmp_path / "latin.yaml")
+
+
+def test_a_file_that_is_too_large_is_refused_at_once(tmp_path):
+    """Also one that never ends; none of it is read as YAML."""
+    with pytest.raises(ConfigError, match=r"/dev/zero: it has more than 16 MiB, and is probably"):
+        read("/dev/zero")
+
+
+def test_a_file_of_too_many_values_is_not_read_to_its_end(monkeypatch):
+    """The rest is not even valid."""
+    monkeypatch.setattr("rosrm.config.documents.MOST_VALUES", 100)
+    said = refusal("- 1\n" * 300 + "[")
+    assert "f.yaml:20" in said
+    assert "more than 100 values" in said
+
+
+def test_mappings_are_merged_as_in_yaml_1_1():
+    """Keys beside `<<` count first, then the first base that has a key."""
+    text = (
+        "x-a: &a {one: 1, two: 1}\nx-b: &b {<<: *a, two: 2, three: 2}\n"
+        "p: {two: 3, <<: *b}\nq: {<<: [*a, *b]}\nr: {'<<': 1}\n"
+    )
+    assert parse(text, "f.yaml").plain() == {
+        "p": {"one": 1, "two": 3, "three": 2}, "q": {"one": 1, "two": 1, "three": 2},
+        "r": {"<<": 1},
+    }  # fmt: skip
+    assert "f.yaml:1:5: <<: a mapping is required" in refusal("<<: 3\n")
+
+
+def test_keys_of_users_are_left_to_them_at_the_top_of_a_file_only():
+    assert parse("x-mine: 1\np: {x-mine: 2}\n", "f.yaml").plain() == {"p": {"x-mine": 2}}
