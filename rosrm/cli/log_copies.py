@@ -15,6 +15,7 @@ import typer
 
 from rosrm import clocks
 from rosrm.cli.options import seconds_of
+from rosrm.cli.output import reader
 from rosrm.cli.output.log_lines import LogStream, Piece, show
 from rosrm.cli.output.plain import echo
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
@@ -60,7 +61,8 @@ def copy_logs(
     # `merge` takes the earliest of the next pieces. A piece without a time follows its predecessor.
     show(merge(*(copy.begin() for copy in copies), key=itemgetter(0)))
     if selection.follow:
-        _follow([copy for copy in copies if not copy.reader.at_end])
+        with reader.needed():
+            _follow([copy for copy in copies if not copy.reader.at_end])
     if exit_code := max(copy.exit_code for copy in copies):
         raise typer.Exit(exit_code)
 
@@ -76,6 +78,9 @@ def _follow(copies: Sequence[_Copy]) -> None:
             show(copy.stream.take())
         copies = [copy for copy in copies if not copy.reader.at_end]
         if copies and not news:
+            for copy in copies:
+                copy.stream.show_unfinished()
+                show(copy.stream.take())
             time.sleep(PERIOD)
 
 

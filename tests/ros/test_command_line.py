@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import fcntl
 import getpass
 import json
 import os
@@ -52,7 +53,7 @@ class Terminal:
         self.directory = directory
         self.environment = {
             **os.environ, "ROS_DOMAIN_ID": str(domain), "COLUMNS": "200", "NO_COLOR": "1",
-            "PYTHONUNBUFFERED": "1",
+            "PYTHONUNBUFFERED": "1", "TERM": "xterm",
         }  # fmt: skip
 
     def start(self, *words: str, **options) -> subprocess.Popen:
@@ -288,6 +289,106 @@ def test_following_ends_with_ctrl_c(rosrm, words, says) -> None:
         _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode in (0, 130)
     assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize(
+    ("words", "says"), [(("logs", "-f", "talker"), "hello"), (("events", "-f"), "counter")]
+)
+def test_following_ends_when_its_reader_has_gone(rosrm, words, says) -> None:
+    """As in `rosrm logs -f talker | grep -m1 hello`, also if no further line comes."""
+    with rosrm.follow(*words, says=says) as (process, _):
+        process.stdout.close()
+        assert process.wait(PATIENCE) == 1
+        assert process.stderr.read() == ""
+
+
+def test_a_line_without_an_end_is_shown_in_a_terminal(rosrm, cluster) -> None:
+    """Such as a prompt; the rest of the line follows it."""
+    go = rosrm.directory / "answered"
+    work = rosrm.file(
+        "asks.yaml",
+        'processes:\n  - name: asks\n    kind: job\n    command: [sh, -c, \'printf "ready> "; '
+        f"while [ ! -e {go} ]; do sleep 0.05; done; echo gone']\n",
+    )
+    rosrm.run("submit", work)
+    cluster.wait("asks", "running")
+    screen, inside = os.openpty()
+    with rosrm.start("logs", "-f", "asks", start_new_session=True, stdout=inside) as process:
+        os.close(inside)
+        try:
+            said = read_until(screen, "ready> ")
+            go.touch()
+            said += read_until(screen, "gone\r\n")
+            assert said == "ready> gone\r\n"
+            assert process.wait(PATIENCE) == 0
+        finally:
+            process.kill()
+            os.close(screen)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
+def test_a_signal_leaves_the_terminal_of_top_as_it_was(rosrm, number) -> None:
+    """With echo and cursor, for the shell that started it."""
+    rosrm.run("status")  # a master can be found in time now
+    screen, inside = os.openpty()
+    usual = termios.tcgetattr(inside)
+    with rosrm.start("top", start_new_session=True, stdin=inside, stdout=inside) as process:
+        try:
+            said = read_until(screen, "q quits")
+            process.send_signal(number)
+            said += read_until(screen, "\x1b[?25h")
+            assert "\x1b[?25l" in said
+            assert process.wait(PATIENCE) == 128 + number
+            assert termios.tcgetattr(inside) == usual
+        finally:
+            process.kill()
+            os.close(inside)
+            os.close(screen)
+
+
+def test_top_can_be_stopped_and_continued(rosrm) -> None:
+    """The shell gets its terminal on Ctrl-Z, and the keys work after `fg`."""
+    rosrm.run("status")  # a master can be found in time now
+    script = (
+        f"set -m; {sys.executable} -m rosrm.cli top --period 60s; "
+        "echo STOPPED $(stty -a | grep -o -e '-\\?echo\\b'); fg; echo ENDED $?"
+    )
+    screen, inside = os.openpty()
+    with subprocess.Popen(
+        ["bash", "-c", script], env=rosrm.environment, start_new_session=True,
+        stdin=inside, stdout=inside, stderr=inside,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY),  # noqa: PLW1509 - no thread runs
+    ) as shell:  # fmt: skip
+        os.close(inside)
+        try:
+            read_until(screen, "q quits")
+            os.write(screen, b"\x1a")
+            read_until(screen, "STOPPED echo\r\n")
+            read_until(screen, "q quits")
+            os.write(screen, b"m")
+            read_until(screen, "q quits")
+            os.write(screen, b"q")
+            read_until(screen, "ENDED 0\r\n")
+        finally:
+            shell.kill()
+            os.close(screen)
+
+
+def test_a_command_in_a_removed_directory_works(rosrm, tmp_path) -> None:
+    """Where no path is absolute, for this command and for the libraries that it uses."""
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    script = 'cd "$0"; rmdir "$0"; exec "$1" ps'
+    program = str(Path(sys.executable).with_name("rosrm"))
+    run = subprocess.run(
+        ["sh", "-c", script, str(gone), program], env=rosrm.environment, capture_output=True,
+        text=True, timeout=PATIENCE, check=False,
+    )  # fmt: skip
+    assert run.returncode == 0, run.stderr
+    assert "talker" in run.stdout
+    assert run.stderr.splitlines() == [
+        "rosrm: the current directory cannot be used (No such file or directory); going on in /"
+    ]
 
 
 def test_top_in_a_terminal(rosrm) -> None:

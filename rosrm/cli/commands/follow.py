@@ -67,7 +67,7 @@ def events(  # noqa: PLR0917 - an argument for each option
 
     With -f the command keeps printing; with --json too, each event is an object on its own line.
     """
-    from rosrm.cli.output import json_forms, tables
+    from rosrm.cli.output import json_forms, reader, tables
 
     if mcap is not None:
         with connection.master(ctx, domain) as client:
@@ -101,8 +101,9 @@ def events(  # noqa: PLR0917 - an argument for each option
             _say_left_out(len(snapshot.events), newest)
             return
         after = snapshot.last_sequence
-        for row in client.events(process=process, host=host, after=after, follow=True):
-            show(row)
+        with reader.needed():
+            for row in client.events(process=process, host=host, after=after, follow=True):
+                show(row)
 
 
 def _write_mcap(path: Path, rows: Iterable[EventRow]) -> None:

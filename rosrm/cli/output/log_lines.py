@@ -63,6 +63,7 @@ class LogStream:
     _number: int = 0
     _is_new: bool = False
     _unfinished: bytes = b""
+    _shown: int = 0
     _when: float = 0.0
     _at_line_start: bool = True
     _context: LineContext = field(default_factory=LineContext)
@@ -102,8 +103,27 @@ class LogStream:
     def close(self) -> None:
         """Complete an unfinished line."""
         if self._unfinished:
-            self._line(self._unfinished + b"\n", self._when)
-            self._unfinished = b""
+            self._complete(b"\n")
+
+    def show_unfinished(self) -> None:
+        """Show a line as far as it has come, such as a prompt, if it is shown in any case."""
+        selects = self.search is not None and self.search.is_selective
+        if self.prefix or selects or len(self._unfinished) == self._shown:
+            return
+        text, is_begun = self._unfinished[self._shown :], self._shown > 0
+        stamp = b"" if is_begun or not self.timestamps else f"{_stamp(self._when)} ".encode()
+        self._add(stamp + text, self._when)
+        self._shown = len(self._unfinished)
+
+    def _complete(self, end: bytes = b"") -> None:
+        """Add the unfinished line, or the rest of it."""
+        line, self._unfinished = self._unfinished + end, b""
+        shown, self._shown = self._shown, 0
+        if shown:
+            self._context.add(line.decode(errors="replace"), self._when)
+            self._add(line[shown:], self._when)
+        else:
+            self._line(line, self._when)
 
     def _say(self, text: str, when: float) -> None:
         """Add a line of rosrm; `when` orders it among the lines of other processes."""
@@ -132,8 +152,7 @@ class LogStream:
             self._when = mark[0] if mark else 0.0
             self._unfinished += line
             if line.endswith(b"\n"):
-                self._line(self._unfinished, self._when)
-                self._unfinished = b""
+                self._complete()
             elif len(self._unfinished) > _LONGEST_LINE:
                 self.close()
 

@@ -4,13 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import os
-import select
 import sys
-import termios
 import time
-import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Final
 
 from rich.console import Console
@@ -18,6 +14,7 @@ from rich.live import Live
 
 from rosrm import clocks
 from rosrm.cli.output import tables, top
+from rosrm.cli.output.terminal import Terminal
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.model.rows import Listing
 from rosrm.wording import duration
@@ -72,10 +69,12 @@ def _keep_up_to_date(
     """Draw each view over the one before."""
     snapshot = look()
     with (
-        _keyboard() as key,
+        Terminal(sys.stdin) as terminal,
         Live(console=console, auto_refresh=False) as screen,
+        terminal.given_back(screen),
         contextlib.suppress(_Quit),
     ):
+        key = terminal.key
         view = _LiveView(screen, key, snapshot, sort)
         for shown in itertools.count(1):
             view.draw()
@@ -147,29 +146,3 @@ def _look_again(look: Callable[..., Listing], before: Listing) -> tuple[Listing,
         return look(), ""
     except NoMaster:
         return before, "the master does not answer"
-
-
-@contextlib.contextmanager
-def _keyboard() -> Iterator[Callable[[float], str]]:
-    """Read keys without echo; yield a function that waits up to some seconds for a key."""
-    if not sys.stdin.isatty():
-        yield _no_key
-        return
-    terminal = sys.stdin.fileno()
-    before = termios.tcgetattr(terminal)
-    tty.setcbreak(terminal)  # Ctrl-C stays a signal
-    try:
-        yield lambda seconds: _key(terminal, seconds)
-    finally:
-        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
-
-
-def _no_key(seconds: float) -> str:
-    time.sleep(seconds)
-    return ""
-
-
-def _key(terminal: int, seconds: float) -> str:
-    """Return the key that is pressed within some seconds; "" if none is."""
-    ready, _, _ = select.select([terminal], [], [], seconds)
-    return os.read(terminal, 1).decode(errors="replace") if ready else ""
