@@ -26,10 +26,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run a command line, by default that of this process, and exit with its code."""
     gc.set_threshold(_COLLECT_AFTER)
     _open_closed_streams()
+    _leave_removed_directory()
     try:
         _run(sys.argv[1:] if arguments is None else arguments)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _leave_removed_directory() -> None:
+    """Change to / if the current directory was removed, where every absolute path would fail."""
+    try:
+        os.getcwd()  # noqa: PTH109 - pathlib is not imported yet
+    except OSError as error:
+        os.chdir("/")
+        _say(f"rosrm: the current directory cannot be used ({error.strerror}); going on in /")
 
 
 def _open_closed_streams() -> None:

@@ -8,6 +8,18 @@ from rosrm.errors import ConfigError
 from rosrm.model.ros_settings import INTERFACE_VARIABLE
 
 
+def check_loopback() -> None:
+    """Check that the parts of rosrm on this machine can reach each other; raises `ConfigError`."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+        try:
+            any_socket.connect(("127.0.0.1", 9))  # only looks for a route
+        except OSError as error:
+            raise ConfigError(
+                f"the loopback interface has no address ({error.strerror}), so the parts of rosrm "
+                "on this machine cannot reach each other; bring it up: `ip link set lo up`"
+            ) from None
+
+
 def check_interface(interface: str) -> None:
     """Check that this machine has a network interface, given by its name or IPv4 address.
 

@@ -72,3 +72,13 @@ def test_without_the_right_it_stays_where_it_is(missing):
     drop = ("setpriv", f"--bounding-set=-{missing}", f"--inh-caps=-{missing}")
     entered, after = _run(_ENTER, *drop)
     assert (entered.split()[0], after.split()[1:]) == ("False", entered.split()[1:])
+
+
+def test_up_without_a_loopback_address_says_so_at_once():
+    """It would wait for its own master without a word."""
+    command = ["unshare", "--net", sys.executable, "-m", "rosrm.cli", "up"]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    if ran.returncode == 1 and "unshare" in ran.stderr:
+        pytest.skip(ran.stderr)
+    assert ran.returncode == 2
+    assert "the loopback interface has no address" in ran.stderr

@@ -83,7 +83,9 @@ def up(  # noqa: PLR0917 - an argument for each option
     from rosrm.config.documents import read
     from rosrm.config.work import checked_work
     from rosrm.extensions.registry import Registry
+    from rosrm.ros.network_interface import check_loopback
 
+    check_loopback()
     registry = Registry.discover()
     amounts = slices.budget_of(budget or [])
     file = config or ctx.ensure_object(CommonOptions).cluster
