@@ -19,7 +19,9 @@ _VARIABLES: Final = frozenset({
     "ROSRM_KEYS", "ROSRM_SCOPE", "ROSRM_SECURITY",
     "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_STATE_HOME",
 })  # fmt: skip
-_PREFIXES: Final = ("CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "RMW_", "ROS_")
+_PREFIXES: Final = (
+    "CYCLONEDDS_", "FASTDDS_", "FASTRTPS_", "RCL_", "RCUTILS_", "RMW_", "ROS_", "ZENOH_",
+)  # fmt: skip
 _ESCAPED: Final = str.maketrans({"\\": r"\\", '"': r"\"", "%": "%%"})
 
 #: The processes of a slave inherit what systemd restricts, so nothing is restricted here.

@@ -153,7 +153,9 @@ def test_the_slave_says_that_its_processes_end_with_it(places, rosrm):
 def test_only_variables_of_ros_and_rosrm_are_needed():
     """Secrets in other variables of the shell do not get into a file that all users can read."""
     shell = {"ROS_DOMAIN_ID": "1", "RMW_IMPLEMENTATION": "x", "PATH": "/bin", "ROSRM_KEYS": "/k",
-             "ROSRM_INSTANCE": "a#1", "TOKEN": "secret"}  # fmt: skip
+             "RCUTILS_LOGGING_USE_STDOUT": "1", "RCL_ASSERT_RMW_ID_MATCHES": "x",
+             "ZENOH_ROUTER_CONFIG_URI": "/z", "ROSRM_INSTANCE": "a#1",
+             "TOKEN": "secret"}  # fmt: skip
     assert set(shell) - set(needed_variables(shell)) == {"ROSRM_INSTANCE", "TOKEN"}
 
 
