@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from rosrm.model.arrays import INDEX_PLACEHOLDER
 from rosrm.model.artifacts import artifacts_fault
@@ -24,13 +23,23 @@ from rosrm.model.devices import need_fault
 from rosrm.model.job_checks import job_fault
 from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import limits_fault
-from rosrm.model.placeholders import ARTIFACTS, DEVICE, WITH_PLACEHOLDERS, placeholder_faults
+from rosrm.model.parameters import parameter_fault
+from rosrm.model.placeholders import (
+    ARTIFACTS,
+    DEVICE,
+    WITH_PLACEHOLDERS,
+    has_variable,
+    placeholder_faults,
+    variable_fault,
+)
 from rosrm.model.secret_rules import is_variable, secret_faults
 from rosrm.model.stop_rules import stop_fault
 from rosrm.model.values import Kind, ProcessSpec, StartOrder
 from rosrm.wording import listed
 
 _TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+#: A name in a rule of ROS, which may have the name of a node and wildcards.
+_REMAPPED: Final = re.compile(r"[^\s:=\0]+(:[^\s:=\0]+)*")
 _LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
 _ROS_ONLY: Final = ("node_name", "namespace", "parameters", "remappings")
 
@@ -161,6 +170,9 @@ def _about_placeholders(spec: ProcessSpec) -> Iterator[Complaint]:
     known = [f"{DEVICE}{need.kind}" for need in spec.devices]
     known += [ARTIFACTS] if spec.artifacts else []
     for key in WITH_PLACEHOLDERS:
+        if key != "environment" and has_variable(repr(getattr(spec, key))):
+            text = f"{key}: {{env.NAME}} stands in `environment` only"
+            yield Complaint((key,), text)
         for fault in placeholder_faults(repr(getattr(spec, key)), known):
             given = "parameters" if key == "parameter_sources" else key
             yield Complaint((given,), f"{given}: {fault}")
@@ -257,14 +269,22 @@ def _about_node(spec: ProcessSpec) -> Iterator[Complaint]:
         text = f"{spec.namespace!r} is not an absolute namespace such as '/robot1'"
         yield Complaint(("namespace",), text)
     for name, value in spec.parameters.items():
-        fault = _fault_of_parameter(value)
+        fault = parameter_fault(name, value)
         if fault:
             yield Complaint(("parameters", *name.split(".")), f"parameters.{name}: {fault}")
     for source in spec.parameter_sources:
         for name, value in source.parameters.items():
-            fault = _fault_of_parameter(value)
+            fault = parameter_fault(name, value)
             if fault:
                 yield Complaint(("parameters",), f"parameters: {source.nodes} {name}: {fault}")
+
+
+def _about_remappings(spec: ProcessSpec) -> Iterator[Complaint]:
+    for rule in spec.remappings.items():
+        for name in rule:
+            if not _REMAPPED.fullmatch(name):
+                text = f"remappings: {name!r} is no name in ROS, such as /scan, image or ~/state"
+                yield Complaint(("remappings", rule[0]), text)
 
 
 def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -275,6 +295,11 @@ def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
     for name, value in spec.environment.items():
         if not is_variable(name, value):
             yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
+        elif fault := variable_fault(value):
+            yield Complaint(("environment", name), f"environment.{name}: {fault}")
+        elif spec.container.image and has_variable(value):
+            text = f"environment.{name}: the variables of an image are not known"
+            yield Complaint(("environment", name), text)
 
 
 def _about_secrets(spec: ProcessSpec) -> Iterator[Complaint]:
@@ -286,20 +311,6 @@ def _about_container(spec: ProcessSpec) -> Iterator[Complaint]:
     fault = container_fault(spec)
     if fault:
         yield Complaint(("container",), fault)
-
-
-def _fault_of_parameter(value: Any) -> str:
-    if value is None:
-        return "a value is required; ROS has no null"
-    items = value if isinstance(value, list) else [value]
-    kinds = {type(item) for item in items}
-    if kinds - {bool, int, float, str}:
-        return "a list in ROS parameters has only booleans, numbers or text"
-    if any(isinstance(item, float) and not math.isfinite(item) for item in items):
-        return "a finite number is required"
-    if any(isinstance(item, int) and not -(2**63) <= item < 2**63 for item in items):
-        return "a whole number of 64 bits is required, -2**63 to 2**63 - 1"
-    return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 
 #: Sections that ask for nothing if they are empty, and what they lack.
@@ -317,7 +328,8 @@ _PROGRAM: Final = ("package", "executable", "module", "command")
 _RULES: Final[tuple[tuple[_Rule, tuple[str, ...]], ...]] = (
     (_about_program, _PROGRAM),
     (_about_ros, ("name", "ros", *_PROGRAM, *_ROS_ONLY, "readiness")),
-    (_about_surroundings, ("working_directory", "environment")),
+    (_about_remappings, ("remappings",)),
+    (_about_surroundings, ("working_directory", "environment", "container")),
     (_about_secrets, ("secrets", "environment")),
     (_about_container, ("container",)),
     (_about_restarts, ("restart",)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from typing import Final
 
 from rosrm.wording import get_close_matches
@@ -18,12 +18,47 @@ ARTIFACTS: Final = "artifacts"
 #: Beginning of the name of a device: `device.camera`.
 DEVICE: Final = "device."
 #: A placeholder with its name in a group.
-PLACEHOLDER: Final = re.compile(r"\{(artifacts|device\.[^{}]*)\}")
+PLACEHOLDER: Final = re.compile(r"\{(artifacts|device\.[^{}]*|env\.[A-Za-z_]\w*)\}")
+#: Value of a variable on the host, in a variable of the process.
+_OF_HOST: Final = re.compile(r"(:?)\{env\.([A-Za-z_]\w*)\}(:?)")
+#: What a shell would replace by the value of a variable.
+_IN_SHELL: Final = re.compile(r"\$(?:([A-Za-z_]\w*)|\{([A-Za-z_]\w*)\})")
 
 #: A text in braces that may be a misspelt placeholder.
 _IN_BRACES: Final = re.compile(r"\{([A-Za-z_]+)((?:[./][^{}]*)?)\}")
 #: Similarity from which a word counts as misspelt.
 _MISSPELT: Final = 0.75
+
+
+def extended(text: str, variables: Mapping[str, str]) -> str:
+    """Return a variable with the values of the host's variables, as in `/x:{env.PYTHONPATH}`.
+
+    Of one that is not set, no `:` remains at an end, where it would mean the current directory.
+    """
+
+    def value(found: re.Match[str]) -> str:
+        before, name, after = found.groups()
+        known = variables.get(name, "")
+        return f"{before}{known}{after}" if known else before and after
+
+    return _OF_HOST.sub(value, text)
+
+
+def has_variable(text: str) -> bool:
+    """Return True if a text has the value of a variable of the host."""
+    return _OF_HOST.search(text) is not None
+
+
+def variable_fault(text: str) -> str:
+    """Return why a variable would not have the value that a user means; "": it has."""
+    found = _IN_SHELL.search(text)
+    if found is None:
+        return ""
+    name = found[1] or found[2]
+    return (
+        f"{found[0]} is not replaced, because no shell reads it. Write {{env.{name}}} for the "
+        f"value of {name} on the host; `prefix: [env, 'NAME={found[0]}']` passes the text as it is"
+    )
 
 
 def placeholder_faults(text: str, known: Collection[str]) -> Iterator[str]:

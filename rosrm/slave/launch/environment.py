@@ -13,6 +13,7 @@ from rosrm.model import start_trace
 from rosrm.model.arrays import INDEX_VARIABLE
 from rosrm.model.artifacts import ARTIFACTS_VARIABLE
 from rosrm.model.devices import DEVICE_VARIABLE, Device, device_environment, device_values
+from rosrm.model.placeholders import extended
 from rosrm.model.values import Assignment, InstanceId, qualified_name
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
@@ -85,6 +86,7 @@ def process_environment(
     """
     spec = assignment.spec
     environment = without_bootstrapper(base)
+    of_host = dict(environment)
     own = [name for name in environment if name.startswith(DEVICE_VARIABLE)]
     for name in (*_IDENTITY, *own, *not_inherited):
         environment.pop(name, None)
@@ -110,7 +112,7 @@ def process_environment(
     if key is not None:
         environment[INSTANCE_KEY] = base64.b64encode(key).decode()
     environment["PYTHONUNBUFFERED"] = "1"
-    environment.update(spec.environment)
+    environment.update((name, extended(text, of_host)) for name, text in spec.environment.items())
     if spec.artifacts and where.artifacts is not None:
         environment[ARTIFACTS_VARIABLE] = str(set_directory(where.artifacts, spec.artifacts))
     values = device_values(assignment.devices, where.devices)

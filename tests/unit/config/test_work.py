@@ -781,3 +781,36 @@ def test_only_options_given_by_a_process_override_those_of_the_cluster(file):
     text = f"processes: [{{name: a, command: x, migration: {migration}}}]"
     (spec,) = load_work(file(text), registry)
     assert spec.migration.options == {"ready": 60.0}
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ("parameters: {a: []}", "parameters.a: an empty list has no type"),
+        ("parameters: {a: \"x\\0y\"}", "parameters.a: a text without the character NUL"),
+        ("parameters: [{'/**': {ros__parameters: {a: []}}}]", "an empty list has no type"),
+        ("components: [{plugin: p, name: n, parameters: {a: []}}]", "n: a: an empty list has no"),
+        ("components: [{plugin: p, name: n, arguments: {a: [1, x]}}]", "n: a: a list in ROS"),
+        ("remappings: {a b: c}", "remappings: 'a b' is no name in ROS"),
+        ("remappings: {a: ''}", "remappings: '' is no name in ROS"),
+    ],
+)  # fmt: skip
+def test_what_every_host_would_refuse_is_refused_before(refusal, keys, said):
+    assert said in refusal(load_work, f"processes: [{{name: a, command: x, ros: true, {keys}}}]")
+
+
+@pytest.mark.parametrize("text", ["/x:$PYTHONPATH", "/x:${PYTHONPATH}", "$PYTHONPATH"])
+def test_a_variable_that_only_a_shell_replaces_is_refused(refusal, text):
+    """The program would search a directory of that name; there is a way to extend a variable."""
+    entry = f"{{name: a, command: x, environment: {{PYTHONPATH: '{text}'}}}}"
+    said = refusal(load_work, f"processes: [{entry}]")
+    assert "no shell reads it. Write {env.PYTHONPATH} for the value" in said
+
+
+def test_a_variable_of_the_host_stands_in_variables_only(file, refusal):
+    """Also beside the values of `foreach`."""
+    text = "processes: [{name: 'a{i}', foreach: {i: [1]}, command: x, KEY}]"
+    ok = text.replace("KEY", "environment: {P: '/{i}:{env.P}', Q: 'a$ 5$'}")
+    assert one(file(ok)).environment == {"P": "/1:{env.P}", "Q": "a$ 5$"}
+    said = refusal(load_work, text.replace("KEY", "arguments: ['{env.P}']"))
+    assert "arguments: {env.NAME} stands in `environment` only" in said

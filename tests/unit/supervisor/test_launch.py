@@ -299,6 +299,24 @@ def test_a_few_packages_are_listed_and_many_counted(prefix):
         find_executable("quux", "x", [prefix])
 
 
+@pytest.mark.parametrize(
+    ("text", "known", "expected"),
+    [
+        ("/x:{env.OF_HOST}", "/a:/b", "/x:/a:/b"),
+        ("{env.OF_HOST}:/x", "/a", "/a:/x"),
+        ("/x:{env.OF_HOST}", "", "/x"),
+        ("{env.OF_HOST}:/x", None, "/x"),
+        ("/x:{env.OF_HOST}:/y", None, "/x:/y"),
+    ],
+)
+def test_a_variable_can_extend_that_of_the_host(tmp_path, text, known, expected):
+    """One that is not set leaves no `:`, which would mean the current directory."""
+    host = {} if known is None else {"OF_HOST": known}
+    given = assignment(command=("/bin/sh",), environment={"OF_HOST": text})
+    made = launched(tmp_path, given, host)
+    assert made.environment["OF_HOST"] == expected
+
+
 # --- parameters -------------------------------------------------------------------------------
 
 

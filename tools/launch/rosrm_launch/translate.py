@@ -12,6 +12,7 @@ from typing import Any, Final
 from rosrm.errors import ConfigError
 from rosrm.model.description_checks import is_node_name
 from rosrm.model.parameters import SECTION, merged_parameters
+from rosrm.model.placeholders import variable_fault
 from rosrm.model.values import ALL_NODES, KEEP_NAME, ParameterSource, qualified_name
 from rosrm.wording import listed
 from rosrm_launch.model import Component, LaunchModel, Load, Omission, Process
@@ -209,11 +210,13 @@ class _Translator:
             entry["command"] = self._paths.in_texts(words)
             entry |= {"ros": True} if one.kind != "command" else {}
         others = {
-            "prefix": self._paths.in_texts(one.prefix),
+            "prefix": self._paths.in_texts([*_literal(one.environment), *one.prefix]),
             "arguments": self._paths.in_texts(one.arguments),
             "parameters": self._parameters(one),
             "remappings": _remappings(one.remappings),
-            "environment": self._paths.in_texts(one.environment),
+            "environment": self._paths.in_texts(
+                {name: text for name, text in one.environment.items() if not variable_fault(text)}
+            ),
             "working_directory": self._paths.in_texts(one.working_directory),
             "lifecycle": self._lifecycle.get(_node_of(one), ""),
             "components": self._components.get(_node_of(one), []),
@@ -299,6 +302,12 @@ def _remappings(rules: Sequence[tuple[str, str]]) -> dict[str, str]:
     for source, target in rules:
         found.setdefault(source, target)
     return found
+
+
+def _literal(variables: Mapping[str, str]) -> list[str]:
+    """Return the words that set variables with a `$`, which `environment` refuses."""
+    words = [f"{name}={text}" for name, text in variables.items() if variable_fault(text)]
+    return ["env", *words] if words else []
 
 
 def _restart(one: Process) -> Any:

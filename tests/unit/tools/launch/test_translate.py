@@ -92,6 +92,14 @@ def test_parameters_of_a_full_name_override_those_of_a_pattern():
     assert (lidar.restart.when, lidar.restart.delay) == ("always", 1.5)
 
 
+def test_a_variable_with_a_dollar_sign_stays_as_it_is():
+    """No shell reads it under launch either."""
+    (entry,) = made(node(0, "a", environment={"A": "$B", "C": "d"}, prefix=["nice"])).work[
+        "processes"
+    ]
+    assert (entry["prefix"], entry["environment"]) == (["env", "A=$B", "nice"], {"C": "d"})
+
+
 def test_a_process_gets_the_sections_of_all_nodes():
     """Its program may have further nodes, such as the costmap of a controller of Nav2."""
     given = [
