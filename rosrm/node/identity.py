@@ -16,6 +16,9 @@ from typing import Final
 KEEP_EVERY: Final = 1.0
 #: Bytes of the key of an instance.
 _KEY_BYTES: Final = 32
+#: Variable with the file that has it, and most bytes of that file.
+_KEY_FILE: Final = "ROSRM_INSTANCE_KEY_FILE"
+_LONGEST_KEY: Final = 64
 #: Most digits of an epoch.
 _EPOCH_DIGITS: Final = 20
 
@@ -107,20 +110,27 @@ def identity_from(environment: Mapping[str, str]) -> NodeIdentity | None:
         keep=environment.get("ROSRM_KEEP", ""),
         keep_every=_seconds(environment.get("ROSRM_KEEP_EVERY", "")),
         epoch_file=environment.get("ROSRM_EPOCH_FILE", ""),
-        key=_key(environment.get("ROSRM_INSTANCE_KEY", "")),
+        key=_key(environment),
     )
 
 
-def _key(text: str) -> bytes | None:
+def _key(environment: Mapping[str, str]) -> bytes | None:
     """Return the key of the instance; None: with `security: none`."""
-    if not text:
+    text, path = environment.get("ROSRM_INSTANCE_KEY", ""), environment.get(_KEY_FILE, "")
+    if not text and path:
+        try:
+            with Path(path).open("rb") as file:
+                text = file.read(_LONGEST_KEY).decode("ascii")
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{_KEY_FILE}={path} cannot be read: {error}") from None
+    elif not text:
         return None
     try:
         key = base64.b64decode(text, validate=True)
     except ValueError:
         key = b""
     if len(key) != _KEY_BYTES:
-        raise ValueError(f"ROSRM_INSTANCE_KEY must have {_KEY_BYTES} bytes in base64")
+        raise ValueError(f"the key of the instance must have {_KEY_BYTES} bytes in base64")
     return key
 
 

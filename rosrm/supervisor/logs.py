@@ -31,7 +31,7 @@ EXCESS_PART: Final = 32
 #: Most older files of one instance: a rotation renames each.
 MOST_KEPT: Final = 1000
 #: Suffixes of files that may lie beside a log and are removed with it.
-FILES_BESIDE: Final = (".parameters.yaml",)
+FILES_BESIDE: Final = (".parameters.yaml", ".key")
 
 
 class LogLimits(NamedTuple):

@@ -9,7 +9,7 @@ One folder holds all files of one host::
     heard                          time of the last contact with the master
     logs/PROCESS.NUMBER.log        output of an instance; .log.1 is older, and so on
     logs/PROCESS.NUMBER.log*.times time index of that output (`log_index`)
-    logs/PROCESS.NUMBER.*          further files of that instance (its parameters)
+    logs/PROCESS.NUMBER.*          further files of that instance (its parameters, its key)
     work/                          default working directory of processes
 
 All logs lie in one folder, because a folder per instance made a short job half as expensive again.
@@ -27,7 +27,9 @@ RECORD = "instances.jsonl"
 HEARD = "heard"
 
 _LOG_NAME = re.compile(r"(.+)\.([0-9]+)\.log")
-_ANY_LOG_FILE = re.compile(r"(.+)\.([0-9]+)\.(?:log(?:\.([0-9]+))?(?:\.[a-z.]+)?|parameters\.yaml)")
+_ANY_LOG_FILE = re.compile(
+    r"(.+)\.([0-9]+)\.(?:log(?:\.([0-9]+))?(?:\.[a-z.]+)?|parameters\.yaml|key)"
+)
 _SAFE = frozenset("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_-.")
 
 

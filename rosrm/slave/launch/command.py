@@ -5,6 +5,8 @@ The order consists of command line, environment and parameters.
 
 from __future__ import annotations
 
+import base64
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +16,8 @@ from rosrm.core.supervisor.rules import AdoptionRule
 from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION, Adoption
-from rosrm.model.values import Assignment, ProcessSpec, RestartPolicy
+from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
+from rosrm.runtime import atomic_file
 from rosrm.runtime.path_calls import at
 from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.artifacts import with_artifacts
@@ -161,6 +164,27 @@ def command_in_image(spec: ProcessSpec) -> tuple[str, ...]:
     if spec.module is not None:
         return ("python3", "-m", spec.module)
     return spec.command
+
+
+def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> str:
+    """Write the key of an instance beside its log and return the path; pruned with the log.
+
+    Raises:
+        LaunchError: it cannot be written.
+    """
+    path = key_path(state_directory, instance)
+    at(path)
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        os.close(atomic_file.replace(str(path), base64.b64encode(key)))
+    except OSError as error:
+        raise LaunchError(f"the key of {instance} cannot be written: {error.strerror}") from None
+    return str(path)
+
+
+def key_path(state_directory: Path, instance: InstanceId) -> Path:
+    """Return the file with the key of an instance."""
+    return log_path(state_directory, instance).with_suffix(".key")
 
 
 def _arguments(assignment: Assignment, state_directory: Path) -> list[str]:

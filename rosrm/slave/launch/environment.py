@@ -26,13 +26,15 @@ EPOCH_FILE: Final = "ROSRM_EPOCH_FILE"
 #: Variables with the directory of the node's snapshots, and the seconds by which they may lag.
 KEEP: Final = "ROSRM_KEEP"
 KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
-#: Variable with the key of an instance, in base64.
+#: Variable with the key of an instance, in base64, for a process in a container; and that with the
+#: file that has the key, for all other processes.
 INSTANCE_KEY: Final = "ROSRM_INSTANCE_KEY"
+KEY_FILE: Final = "ROSRM_INSTANCE_KEY_FILE"
 #: Variables that identify a process. A slave that was itself started by rosrm passes none of them
 #: on.
 _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
-    "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY,
+    "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY, KEY_FILE,
     INDEX_VARIABLE,
     ARTIFACTS_VARIABLE, start_trace.VARIABLE,
 )  # fmt: skip
@@ -54,6 +56,8 @@ class ProcessLocation:
         keep_every: seconds by which a snapshot may be behind the state.
         epoch_file: file with the newest epoch of the master; None: there is none.
         instance_key: returns the key of an instance; None: with `security: none`.
+        key_file: writes the key of an instance into a file and returns its path, because a process
+            shows its environment to others: in logs, in reports, to its children.
         devices: devices of the host.
         artifacts: directory of the artifacts of all processes; None: there are none.
     """
@@ -65,6 +69,7 @@ class ProcessLocation:
     keep_every: float = 1.0
     epoch_file: Path | None = None
     instance_key: Callable[[InstanceId], bytes | None] = no_key
+    key_file: Callable[[InstanceId], str] | None = None
     devices: tuple[Device, ...] = ()
     artifacts: Path | None = None
 
@@ -109,8 +114,10 @@ def process_environment(
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     # Of each process, because a migratable node without a key takes messages of strangers.
     key = where.instance_key(assignment.instance)
-    if key is not None:
+    if key is not None and spec.container.image:  # its image does not have the files of the host
         environment[INSTANCE_KEY] = base64.b64encode(key).decode()
+    elif key is not None and where.key_file is not None:
+        environment[KEY_FILE] = where.key_file(assignment.instance)
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update((name, extended(text, of_host)) for name, text in spec.environment.items())
     if spec.artifacts and where.artifacts is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import sys
@@ -27,7 +28,7 @@ from rosrm.runtime.path_calls import NoAnswer, PathCalls, at
 from rosrm.runtime.ros_wheels import without_bootstrapper
 from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.epoch import EPOCH_NOTE
-from rosrm.slave.launch.command import order_of, plain_launch
+from rosrm.slave.launch.command import key_path, order_of, plain_launch, write_key
 from rosrm.slave.launch.environment import ProcessLocation, no_key
 from rosrm.slave.launch.lanes import Lanes
 from rosrm.slave.launch.launchers import Launchers
@@ -220,6 +221,8 @@ class Starter:
     def ended(self, instance: InstanceId) -> None:
         """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
+        with contextlib.suppress(OSError):
+            key_path(self.supervisor.state, instance).unlink(missing_ok=True)
         self.replication.ended(instance)
 
     def _fetched(self, assignment: Assignment, fault: str) -> None:
@@ -366,12 +369,15 @@ class Starter:
                     assignment.instance, path,
                 )  # fmt: skip
 
+    def _write_key(self, instance: InstanceId) -> str:
+        return write_key(instance, self.instance_key(instance) or b"", self.supervisor.state)
+
     def _location(self) -> ProcessLocation:
         config = self.config
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
             self.snapshots, config.keep.every, config.state / EPOCH_NOTE, self.instance_key,
-            self.endpoint.description.devices, self.artifacts.root,
+            self._write_key, self.endpoint.description.devices, self.artifacts.root,
         )  # fmt: skip
 
 

@@ -11,6 +11,8 @@ namespace rosrm_node
 namespace
 {
 
+/// Most bytes of the file with the key of an instance.
+constexpr std::streamsize kLongestKey = 64;
 /// Most digits of an epoch.
 constexpr std::streamsize kEpochDigits = 20;
 
@@ -58,16 +60,24 @@ Bytes from_base64(const std::string & text)
   return bytes;
 }
 
-std::optional<Key> instance_key(const std::string & text)
+std::optional<Key> instance_key(std::string text, const std::string & path)
 {
-  if (text.empty()) {
+  if (text.empty() && path.empty()) {
     return std::nullopt;
+  }
+  if (text.empty()) {
+    std::ifstream file(path);
+    text.assign(kLongestKey, '\0');
+    file.read(text.data(), kLongestKey);
+    text.resize(static_cast<std::size_t>(file.gcount()));
   }
   try {
     return key_of(from_base64(text));
   } catch (const std::invalid_argument &) {
     // Without a key the node would accept all messages.
-    throw std::invalid_argument("ROSRM_INSTANCE_KEY must have 32 bytes in base64");
+    throw std::invalid_argument(
+      "the key of the instance must have 32 bytes in base64" +
+      (path.empty() ? std::string() : ", in the file " + path));
   }
 }
 
@@ -128,7 +138,8 @@ std::optional<NodeIdentity> identity_from(const Environment & environment)
   identity.keep = environment("ROSRM_KEEP");
   identity.keep_every = seconds_in(environment("ROSRM_KEEP_EVERY"));
   identity.epoch_file = environment("ROSRM_EPOCH_FILE");
-  identity.key = instance_key(environment("ROSRM_INSTANCE_KEY"));
+  identity.key =
+    instance_key(environment("ROSRM_INSTANCE_KEY"), environment("ROSRM_INSTANCE_KEY_FILE"));
   return identity;
 }
 

@@ -45,6 +45,20 @@ def test_a_node_with_a_damaged_key_does_not_start(key):
         identity_from({**FULL, "ROSRM_INSTANCE_KEY": key})
 
 
+def test_the_key_of_the_instance_is_read_from_its_file(tmp_path):
+    """A node whose file is missing or damaged does not start."""
+    path = tmp_path / "key"
+    variables = {**FULL, "ROSRM_INSTANCE_KEY_FILE": str(path)}
+    with pytest.raises(ValueError, match="cannot be read"):
+        identity_from(variables)
+    for content in (b"", b"c2hvcnQ=", b"\xff" * 44, b"A" * 10_000):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=r"base64|cannot be read"):
+            identity_from(variables)
+    path.write_bytes(base64.b64encode(bytes(range(32))))
+    assert identity_from(variables).key == bytes(range(32))
+
+
 @pytest.mark.parametrize("missing", ["ROSRM_INSTANCE", "ROSRM_STATE_CONFIG"])
 def test_without_rosrm_there_is_no_identity(missing):
     """The node is then a plain rclpy node."""

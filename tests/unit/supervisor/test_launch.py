@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import stat
 import subprocess
 import sys
 from dataclasses import replace
@@ -28,7 +29,7 @@ from rosrm.model.values import (
 )
 from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
-from rosrm.slave.launch.command import command_in_image, order_of, plain_launch
+from rosrm.slave.launch.command import command_in_image, order_of, plain_launch, write_key
 from rosrm.slave.launch.environment import (
     ProcessLocation,
     process_environment,
@@ -564,20 +565,36 @@ def test_a_process_knows_the_file_with_the_masters_epoch():
     assert "ROSRM_EPOCH_FILE" not in process_environment(assignment(command=("x",)), made, HERE)
 
 
-def test_each_process_gets_the_key_of_its_instance():
+KEYED = replace(HERE, instance_key=lambda instance: str(instance).encode().ljust(32))
+
+
+def test_each_process_gets_the_key_of_its_instance_in_a_file(tmp_path):
     """A migratable node without one would take every message about a handoff as its master's.
 
-    It may be in any process, also in one whose strategy moves no state of nodes.
+    It may be in any process, also in one whose strategy moves no state of nodes. The environment,
+    which programs print and children inherit, does not have the key.
     """
-    here = replace(HERE, instance_key=lambda instance: str(instance).encode().ljust(32))
-    key = "dGFsa2VyIzcgICAgICAgICAgICAgICAgICAgICAgICA="
+
+    def write(instance):
+        return write_key(instance, KEYED.instance_key(instance), tmp_path)
+
+    here = replace(KEYED, key_file=write)
     stateful = replace(assignment(command=("x",)), snapshots_from=1)
-    for one in (stateful, assignment(command=("x",))):
+    for one in (stateful, assignment(command=("sleep", "9"))):
         made = process_environment(one, {}, here)
-        assert made["ROSRM_INSTANCE_KEY"] == key
+        assert "dGFsa2VyIzcg" not in str(made)
+        path = Path(made["ROSRM_INSTANCE_KEY_FILE"])
+        assert stat.S_IMODE(path.stat().st_mode) == 0o600
         assert identity_from(made).key == b"talker#7".ljust(32)
-    assert "ROSRM_INSTANCE_KEY" in process_environment(shadow(), {}, here)
-    assert "ROSRM_INSTANCE_KEY" not in process_environment(stateful, made, HERE)
+    assert "ROSRM_INSTANCE_KEY_FILE" in process_environment(shadow(), {}, here)
+    assert "ROSRM_INSTANCE_KEY_FILE" not in process_environment(stateful, made, HERE)
+
+
+def test_a_process_in_a_container_gets_its_key_in_the_environment():
+    """The files of the host are not in its image."""
+    made = process_environment(assignment(command=("x",), container=Container("image")), {}, KEYED)
+    assert identity_from(made).key == b"talker#7".ljust(32)
+    assert "ROSRM_INSTANCE_KEY" not in process_environment(assignment(command=("x",)), made, HERE)
 
 
 def test_the_identity_of_the_slave_is_not_inherited():
