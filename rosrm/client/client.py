@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Final, Literal, Union, cast
+from typing import TYPE_CHECKING, Any, Literal, Union, cast
 
 from rosrm import clocks
 from rosrm.client.connecting import connect, ros_settings, row_of, security_mode
@@ -34,8 +34,6 @@ Work = Union[str, "os.PathLike[str]", Mapping[str, Any], ProcessSpec]
 Path = Union[str, "os.PathLike[str]"]
 #: One name or several.
 Names = str | Iterable[str]
-#: Number of events in one listing that leaves out none, as in `List.srv`.
-_ALL_NEW: Final = 2**32 - 1
 
 
 def _warn(text: str) -> None:
@@ -366,21 +364,23 @@ class Client:
             follow: True: then yield new events until the time-out.
             timeout: seconds of following; None: no limit.
         """
+        from rosrm.client.event_feed import EventFeed  # noqa: PLC0415 - only for events
 
-        def look(on_wait: Callable[[float], None]) -> Listing:
-            return self.list(
-                events=True, process=process, host=host, after=after, newest=newest,
-                on_wait=on_wait,
-            )  # fmt: skip
+        def ask(after: int, newest: int) -> Listing:
+            def look(on_wait: Callable[[float], None]) -> Listing:
+                return self.list(
+                    events=True, process=process, host=host, after=after, newest=newest,
+                    on_wait=on_wait,
+                )  # fmt: skip
+
+            return ask_until_answered(look, self._notify, deadline if follow else 0.0)
 
         deadline = deadline_after(timeout)
-        while True:
-            view = ask_until_answered(look, self._notify, deadline if follow else 0.0)
-            yield from view.events
-            if not follow or clocks.boot_time() >= deadline:
-                return
-            after, newest = view.last_sequence, _ALL_NEW
+        feed = EventFeed(ask, after, newest)
+        yield from feed.new()
+        while follow and clocks.boot_time() < deadline:
             time.sleep(PERIOD)
+            yield from feed.new()
 
     def logs(
         self, process: str, *, tail: int = 0, since: float = 0.0, host: str = "",

@@ -112,6 +112,26 @@ def test_followed_events_are_complete(client, master, monkeypatch):
     assert [one.sequence for one in following] == list(range(1, 2003))
 
 
+@pytest.mark.parametrize("process", ["", "talker"])
+@pytest.mark.parametrize("kept", [1, 3])
+@pytest.mark.parametrize("number", [1, 2, 6])
+def test_followed_events_after_a_journal_gap_are_complete(
+    client, master, monkeypatch, process, kept, number
+):
+    """New events have the sequences of lost ones, which the follower has seen."""
+    master.events = [event(one) for one in range(1, 5)]
+    news = [event(kept + 1 + one, message=f"new {one}") for one in range(number)]
+
+    def later(seconds):
+        master.events = master.events[:kept] + news
+
+    monkeypatch.setattr("time.sleep", later)
+    following = list(client.events(process=process, follow=True, timeout=0.2))
+    assert following == [event(one) for one in range(1, 5)] + news
+    again = client.events(process=process, after=kept + number, follow=True, timeout=0.1)
+    assert list(again) == []
+
+
 def test_events_that_are_not_followed_do_not_wait_for_a_master(client, master):
     master.fails = NoMaster("no answer")
     with pytest.raises(NoMaster):

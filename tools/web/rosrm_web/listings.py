@@ -39,15 +39,15 @@ def _list(client: Client, parts: dict[str, Any]) -> Listing:
 
 
 class Listings:
-    """The newest listing of each combination of parts."""
+    """The newest listing of each request."""
 
     def __init__(self, link: MasterLink) -> None:
         self._link = link
-        self._recent: dict[tuple[str, ...], _Recent] = {}
+        self._recent: dict[frozenset[tuple[str, Any]], _Recent] = {}
 
     async def get(self, **parts: Any) -> Listing:
-        """Return the requested parts, as `Client.list`; only whole parts, no filters."""
-        key = tuple(sorted(parts))
+        """Return the requested parts, as `Client.list`."""
+        key = frozenset(parts.items())
         recent = self._recent.get(key)
         if recent is None or not recent.is_usable:
             request = self._link.ask(partial(_list, parts=parts))

@@ -142,3 +142,18 @@ def test_the_events_of_a_former_journal_are_dropped():
         gateway.close()
 
     asyncio.run(scene())
+
+
+def test_listings_with_other_filters_are_other_listings():
+    """A listing of the failing plugins is no listing of all."""
+
+    async def scene() -> None:
+        master = Master()
+        gateway, _ = await started(master)
+        before = len(master.asked)
+        for plugins in (True, "failing", True, "failing"):
+            await gateway.list(plugins=plugins)
+        asked = [parts["plugins"] for parts in master.asked[before:]]
+        assert asked == [True, "failing"]
+
+    asyncio.run(scene())
