@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <array>
-#include <cstring>
 #include <map>
 #include <stdexcept>
 
@@ -50,6 +49,16 @@ rclcpp::NodeOptions options_for(
   return options.arguments(arguments).start_parameter_services(false);
 }
 
+/// Return options by which messages come through DDS, although the author's node may have others:
+/// rclcpp's intra-process communication refuses serialised messages.
+template<typename OptionsT>
+OptionsT through_dds()
+{
+  OptionsT options;
+  options.use_intra_process_comm = rclcpp::IntraProcessSetting::Disable;
+  return options;
+}
+
 rclcpp::QoS latched(std::size_t depth)
 {
   return rclcpp::QoS(rclcpp::KeepLast(depth)).reliable().transient_local();
@@ -67,7 +76,7 @@ rclcpp::SerializedMessage serialised_message(const Bytes & data)
 {
   rclcpp::SerializedMessage message(data.size());
   auto & raw = message.get_rcl_serialized_message();
-  std::memcpy(raw.buffer, data.data(), data.size());
+  std::copy(data.begin(), data.end(), raw.buffer);
   raw.buffer_length = data.size();
   return message;
 }
@@ -113,6 +122,11 @@ public:
       });
   }
 
+  bool is_shut_down() override
+  {
+    return !node_.get_node_base_interface()->get_context()->is_valid();
+  }
+
   void log(Severity severity, const std::string & text) override
   {
     if (severity == Severity::kError) {
@@ -127,7 +141,8 @@ public:
   int open_writer(const std::string & topic, std::size_t depth) override
   {
     writers_[++last_] =
-      node_.rclcpp::Node::create_publisher<SealedMessage>(topic, latched(depth));
+      node_.rclcpp::Node::create_publisher<SealedMessage>(
+      topic, latched(depth), through_dds<rclcpp::PublisherOptions>());
     return last_;
   }
 
@@ -139,7 +154,7 @@ public:
       [this, number](std::shared_ptr<const rclcpp::SerializedMessage> message) {
         const Turn turn(node_.turn_);
         node_.session_->received(number, bytes_of(*message));
-      });
+      }, through_dds<rclcpp::SubscriptionOptions>());
     return number;
   }
 
@@ -237,7 +252,9 @@ Node::Node(const std::string & name, const rclcpp::NodeOptions & options)
   middleware_ = std::make_unique<RclcppMiddleware>(*this);
   session_ = std::make_unique<HandoffSession>(*middleware_, *identity);
   keep_parameters();
-  add_parameter_services();
+  if (options.start_parameter_services()) {
+    add_parameter_services();
+  }
   session_->begin();
   at_shutdown_ = get_node_base_interface()->get_context()->add_pre_shutdown_callback(
     [this] {store();});
@@ -367,7 +384,10 @@ Timer::SharedPtr Node::add_timer(
         alive->cancel();
       }
     };
-  one->follows_ros_time = [this, is_wall] {return !is_wall && get_clock()->ros_time_is_active();};
+  one->follows_ros_time = [this, is_wall] {
+      const auto clock = get_clock();  // rclcpp raises if a clock of another type is asked
+      return !is_wall && clock->get_clock_type() == RCL_ROS_TIME && clock->ros_time_is_active();
+    };
   session_->entities.add(one);
   return timer;
 }
@@ -388,8 +408,11 @@ void Node::keep_parameters()
       parameters_known_ = names.size();
       ParameterEvent event;
       event.node = get_fully_qualified_name();
-      for (const auto & parameter : get_parameters(names)) {
-        event.changed_parameters.push_back(parameter.to_parameter_msg());
+      for (const auto & name : names) {
+        rclcpp::Parameter parameter;
+        if (get_parameter(name, parameter)) {  // false: declared, but never set
+          event.changed_parameters.push_back(parameter.to_parameter_msg());
+        }
       }
       return event;
     },
@@ -397,14 +420,21 @@ void Node::keep_parameters()
       std::vector<rclcpp::Parameter> differing;
       for (const auto & message : event.changed_parameters) {
         const auto parameter = rclcpp::Parameter::from_parameter_msg(message);
+        if (parameter.get_type() == rclcpp::PARAMETER_NOT_SET) {
+          continue;  // of a source in Python, which names those without a value, too
+        }
         if (!has_parameter(parameter.get_name())) {
           declare_parameter(parameter.get_name(), parameter.get_parameter_value());
         }
-        if (serialised(get_parameter(parameter.get_name()).to_parameter_msg()) !=
-        serialised(message))
+        rclcpp::Parameter own;
+        if (!get_parameter(parameter.get_name(), own) ||
+        serialised(own.to_parameter_msg()) != serialised(message))
         {
           differing.push_back(parameter);
         }
+      }
+      if (differing.empty()) {
+        return;  // rclcpp refuses an empty list
       }
       // In one call, because the values may be valid only together.
       const auto result = set_parameters_atomically(differing);

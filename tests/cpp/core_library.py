@@ -8,7 +8,7 @@ import importlib.util
 import os
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -48,14 +48,16 @@ def run_compiler(*arguments: str) -> None:
 
 @cache
 def library_in(folder: Path) -> Path:
-    """Return the library, compiled in a folder."""
+    """Return the library of the core, compiled in a folder."""
+    bridge = Path(__file__).with_name("bridge.cpp")
+    return library_of([*sorted((PACKAGE / "src/core").glob("*.cpp")), bridge], folder)
+
+
+def library_of(sources: Iterable[Path], folder: Path) -> Path:
+    """Return a library, compiled in a folder unless that has it."""
     path = folder / "libcore.so"
     if path.exists():
         return path
-    sources = [
-        *sorted((PACKAGE / "src/core").glob("*.cpp")),
-        Path(__file__).with_name("bridge.cpp"),
-    ]
     # One unit, because the headers of the standard library take more time than the core itself.
     unit = folder / "unit.cpp"
     unit.write_text("".join(f'#include "{one}"\n' for one in sources))
@@ -84,6 +86,9 @@ def loaded(path: Path) -> ctypes.CDLL:
     assert spec.origin is not None
     ctypes.CDLL(spec.origin, ctypes.RTLD_GLOBAL)
     library = ctypes.CDLL(str(path), os.RTLD_LAZY)
+    if hasattr(library, "contract_run"):
+        library.contract_run.restype = library.contract_names.restype = ctypes.c_char_p
+        return library
     for name in ("node_new", "buffer_new", "cuts_new"):
         getattr(library, name).restype = ctypes.c_void_p
     for name in ("bridge_error", "cuts_take", "cuts_missing", "snapshot_newest"):

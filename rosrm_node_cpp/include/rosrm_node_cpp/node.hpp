@@ -272,12 +272,15 @@ typename rclcpp::Subscription<MessageT>::SharedPtr Node::create_subscription(
         [message, callback] {callback(*message);}};
     };
   const auto input = std::make_shared<Input>();
+  rclcpp::SubscriptionOptions options;
+  // Otherwise messages of this process would come without time stamps and numbers.
+  options.use_intra_process_comm = rclcpp::IntraProcessSetting::Disable;
   const auto plain = rclcpp::Node::create_subscription<MessageT>(
     name, qos, [this, input, arrival](
       std::shared_ptr<const MessageT> message, const rclcpp::MessageInfo & info) {
       const Turn turn(turn_);
       session_->entities.received(*input, arrival(message, info));
-    });
+    }, options);
   const std::weak_ptr<rclcpp::Subscription<MessageT>> reader = plain;
   input->topic = plain->get_topic_name();
   input->buffered = buffer;

@@ -90,7 +90,13 @@ void NodeEntities::cycle(const std::function<void()> & callback)
   callback();
   in_cycle = false;
   ++sequence;
-  on_cycle();
+  try {
+    on_cycle();
+  } catch (const std::exception &) {
+    if (!middleware.is_shut_down()) {  // a signal may shut ROS down while a callback runs
+      throw;
+    }
+  }
 }
 
 void NodeEntities::ticked(const std::function<void()> & callback)

@@ -27,6 +27,9 @@ public:
   /// Call `HandoffSession::wake` once after some seconds; a later call replaces the time.
   virtual void wake_in(double seconds) = 0;
 
+  /// Return true after the shutdown of ROS, when its calls fail.
+  virtual bool is_shut_down() {return false;}
+
   virtual void log(Severity severity, const std::string & text) = 0;
 
   /// Create a publisher; return its number.

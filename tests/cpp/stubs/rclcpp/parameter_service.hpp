@@ -1,4 +1,4 @@
-// Declarations that mirror rclcpp 28.1.6; see ../README.md.
+// Declarations that mirror rclcpp 28.1.6, and a double that behaves alike; see ../README.md.
 #pragma once
 
 #include <memory>
@@ -13,9 +13,13 @@ class ParameterService
 public:
   ParameterService(
     const std::shared_ptr<node_interfaces::NodeBaseInterface> node_base,
-    const std::shared_ptr<node_interfaces::NodeServicesInterface> node_services,
-    node_interfaces::NodeParametersInterface * node_parameters,
-    const QoS & qos = ParametersQoS());
+    const std::shared_ptr<node_interfaces::NodeServicesInterface>,
+    node_interfaces::NodeParametersInterface *, const QoS & = ParametersQoS())
+  {
+    node_base->get_context()->stub_check();
+    ++stub_parameter_services;
+  }
+  ~ParameterService() {--stub_parameter_services;}
 };
 
 }  // namespace rclcpp
