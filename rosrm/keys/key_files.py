@@ -160,17 +160,18 @@ def revoke(home: Path, principals: Collection[Principal]) -> None:
         )
 
 
-def grants_version(home: Path) -> tuple[tuple[int, int], ...]:
+def grants_version(home: Path) -> tuple[tuple[int, ...], ...]:
     """Return a value that changes whenever the grants or the cluster's secret change."""
     return tuple(_version(home / name) for name in (GRANTS_FILE, CLUSTER_FILE))
 
 
-def _version(path: Path) -> tuple[int, int]:
+def _version(path: Path) -> tuple[int, ...]:
     try:
         facts = path.stat()
     except FileNotFoundError:
-        return (0, 0)
-    return (facts.st_mtime_ns, facts.st_ino)
+        return ()
+    # The time of modification alone can be set, and is coarse on some file systems.
+    return (facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns)
 
 
 def _all_grants(home: Path) -> list[tuple[Grant, bool]]:

@@ -179,19 +179,24 @@ class Stage:
         shadow: bool = False, keep: Any = "", **named: Any,
     ) -> Any:  # fmt: skip
         """Create a node in the environment that a slave would give the instance."""
+        with pytest.MonkeyPatch.context() as patch:
+            for variable, value in self.environment(name, number, shadow=shadow, keep=keep).items():
+                patch.setenv(variable, value)
+            if alias:
+                named["cli_args"] = ["--ros-args", "-r", f"__node:={alias}"]
+            return self.add(make(context=self.context, **named))
+
+    def environment(
+        self, name: str, number: int, *, shadow: bool, keep: Any = ""
+    ) -> dict[str, str]:
+        """Return the variables that a slave would give an instance."""
         key = b"" if self.keys is None else self.keys.of_instance(name, number)
-        variables = {
+        return {
             "ROSRM_INSTANCE_KEY": base64.b64encode(key).decode(),
             "ROSRM_INSTANCE": f"{name}#{number}", "ROSRM_PROCESS": name, "ROSRM_NODE": f"/{name}",
             "ROSRM_STATE_CONFIG": TOPIC, "ROSRM_MASTER": CLUSTER, "ROSRM_EPOCH": str(EPOCH),
             "ROSRM_SHADOW": "1" if shadow else "", "ROSRM_KEEP": str(keep),
         }  # fmt: skip
-        with pytest.MonkeyPatch.context() as patch:
-            for variable, value in variables.items():
-                patch.setenv(variable, value)
-            if alias:
-                named["cli_args"] = ["--ros-args", "-r", f"__node:={alias}"]
-            return self.add(make(context=self.context, **named))
 
     def spin_until(
         self,

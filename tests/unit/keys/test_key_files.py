@@ -53,6 +53,16 @@ def test_each_change_of_grants_or_secret_changes_their_version(tmp_path: Path) -
     assert len(seen) == 1 + len(changes)
 
 
+def test_a_file_of_the_same_time_is_another_version(tmp_path: Path) -> None:
+    """A copy of a backup with `cp -p` or `rsync -a` has the time of the original."""
+    key_files.add_grant(tmp_path, ROBOT, Role.HOST)
+    path, before = tmp_path / key_files.GRANTS_FILE, key_files.grants_version(tmp_path)
+    times = path.stat()
+    path.write_text(path.read_text(encoding="utf-8") + "\n", encoding="utf-8")
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    assert key_files.grants_version(tmp_path) != before
+
+
 def test_a_full_disk_keeps_the_former_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A rotation that fails does not end the keys that are in use."""
     secret = key_files.make_secret(tmp_path)
