@@ -46,7 +46,7 @@ class Podman:
         if program is None:
             raise SkipPlugin("podman is not installed")
         self._program, self._python = program, context.python
-        self._label = sha256(os.fsencode(context.state)).hexdigest()[:32]
+        self._label = sha256(os.fsencode(context.state)).hexdigest()[:12]
         self._folder = context.state / "containers"
         self._images: set[str] = set()  # those that were on this host once
 
