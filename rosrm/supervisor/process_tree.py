@@ -3,7 +3,7 @@
 The supervisor is a subreaper: a process whose parent ends becomes its child. So the last process of
 an instance always dies as the supervisor's child, and SIGCHLD reports it. An exception follows a
 take-over (an earlier supervisor was killed): the processes are not children of the new supervisor,
-which detects their end by a pidfd, or by looking at /proc once a second if no descriptor is left.
+which detects their end by a pidfd, or by looking at /proc once a second if none can be had.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from rosrm.supervisor import descriptors, own_log, procfs
 from rosrm.supervisor.instance_groups import InstanceGroups
 from rosrm.supervisor.procfs import Stat
 
-#: In place of a pidfd: no descriptor was left, and `look` finds the end of the process.
+#: In place of a pidfd: none can be had, and `look` finds the end of the process.
 _NO_PIDFD: Final = -1
 #: Seconds between two looks at such processes.
 _LOOK_EVERY: Final = 1.0
@@ -55,7 +55,7 @@ class ProcessTrees:
         self._children: dict[int, Key] = {}
         self._taken_over: dict[int, int] = {}
         self._in_foreign_session: set[Key] = set()
-        self._looked_at: dict[int, tuple[Key, int]] = {}
+        self._looked_at: dict[int, tuple[int, Callable[[], None]]] = {}  # pid: its start, the call
         self._next_look = 0.0
         self._most_watched = descriptors.most_watched()
         self._adopted: dict[int, Key | None] = {}
@@ -74,7 +74,7 @@ class ProcessTrees:
         An earlier supervisor spawned it, or it is adopted.
         """
         try:
-            pidfd = os.pidfd_open(leader.pid) if self._has_room() else _NO_PIDFD
+            pidfd = procfs.open_pidfd(leader.pid) if self._has_room() else _NO_PIDFD
         except ProcessLookupError:
             return False
         now = procfs.read_stat(leader.pid)
@@ -86,22 +86,19 @@ class ProcessTrees:
         self._add(key, leader.pid, leader.start)
         if leader.session != leader.pid:  # it is adopted
             self._in_foreign_session.add(key)
-        if pidfd == _NO_PIDFD:
-            self._looked_at[leader.pid] = (key, leader.start)
-        else:
-            self._watch(pidfd, lambda: self._taken_over_ended(key, leader.pid))
+        self._watch(pidfd, leader, lambda: self._taken_over_ended(key, leader.pid))
         return True
 
     def look(self, now: float) -> None:
-        """Find the ends of the leaders for which no descriptor was left; called in each round."""
+        """Find the ends of the processes that have no descriptor; called in each round."""
         if now < self._next_look or not self._looked_at:
             return
         self._next_look = now + _LOOK_EVERY
-        for pid, (key, birth) in list(self._looked_at.items()):
+        for pid, (birth, ended) in list(self._looked_at.items()):
             stat = procfs.read_stat(pid)
             if stat is None or not stat.alive or stat.start != birth:
                 del self._looked_at[pid]
-                self._taken_over_ended(key, pid)
+                ended()
 
     def deadline(self) -> float | None:
         """Return the time at which `look` has work; None: never."""
@@ -132,9 +129,7 @@ class ProcessTrees:
         self._births[key] = birth
 
     def _taken_over_ended(self, key: Key, pid: int) -> None:
-        pidfd = self._taken_over.pop(pid)
-        if pidfd != _NO_PIDFD:
-            self._unwatch(pidfd)
+        self._unwatch(self._taken_over.pop(pid))
         self.watch_strays(key, self._left(key, pid))
         left, memory = key in self._strays, self._groups.out_of_memory(key)
         self._happened(Exited(key, UNKNOWN_EXIT, leftovers=left, out_of_memory=memory))
@@ -236,17 +231,17 @@ class ProcessTrees:
         for stat in found:
             # Beyond the limit they are found again when a watched one ends.
             if stat.pid not in watched and (self._has_room() or not watched):
-                self._watch_stray(key, stat.pid, watched)
+                self._watch_stray(key, stat, watched)
         if not watched:
             del self._strays[key]
 
-    def _watch_stray(self, key: Key, pid: int, watched: dict[int, int]) -> None:
+    def _watch_stray(self, key: Key, stat: Stat, watched: dict[int, int]) -> None:
+        pid = stat.pid
         try:
-            pidfd = os.pidfd_open(pid)
+            pidfd = watched[pid] = procfs.open_pidfd(pid)
         except ProcessLookupError:
             return
-        watched[pid] = pidfd
-        self._watch(pidfd, lambda: self._stray_ended(key, pid))
+        self._watch(pidfd, stat, lambda: self._stray_ended(key, pid))
 
     def _stray_ended(self, key: Key, pid: int) -> None:
         watched = self._strays[key]
@@ -275,8 +270,8 @@ class ProcessTrees:
             self._signal_leader(key, session, number)
         if key in self._strays:
             self.watch_strays(key, self._find(key))
-            for pidfd in self._strays.get(key, {}).values():
-                _send(signal.pidfd_send_signal, pidfd, number, "a left-over process")
+            for pid, pidfd in self._strays.get(key, {}).items():
+                _send_to(pid, pidfd, number)
 
     def _signal_leader(self, key: Key, leader: int, number: int) -> None:
         """Send a signal to the process group of a leader.
@@ -289,11 +284,7 @@ class ProcessTrees:
             _send(os.killpg, leader, number, f"the group {leader}")
             return
         self.watch_strays(key, _below(leader))
-        pidfd = self._taken_over[leader]
-        if pidfd == _NO_PIDFD:
-            _send(os.kill, leader, number, str(leader))
-        else:
-            _send(signal.pidfd_send_signal, pidfd, number, str(leader))
+        _send_to(leader, self._taken_over[leader], number)
 
     def kill(self, found: Iterable[Stat]) -> None:
         """Send SIGKILL to processes that belong to no instance any more."""
@@ -306,12 +297,16 @@ class ProcessTrees:
         """Return True if another process may be watched by a descriptor."""
         return len(self._selector.get_map()) < self._most_watched
 
-    def _watch(self, pidfd: int, ended: Callable[[], None]) -> None:
-        self._selector.register(pidfd, selectors.EVENT_READ, ended)
+    def _watch(self, pidfd: int, stat: Stat, ended: Callable[[], None]) -> None:
+        if pidfd == _NO_PIDFD:
+            self._looked_at[stat.pid] = (stat.start, ended)
+        else:
+            self._selector.register(pidfd, selectors.EVENT_READ, ended)
 
     def _unwatch(self, pidfd: int) -> None:
-        self._selector.unregister(pidfd)
-        os.close(pidfd)
+        if pidfd != _NO_PIDFD:
+            self._selector.unregister(pidfd)
+            os.close(pidfd)
 
 
 def _below(pid: int) -> list[Stat]:
@@ -323,6 +318,13 @@ def _below(pid: int) -> list[Stat]:
 def mark(key: Key) -> str:
     """Return the value by which the environment of its processes names an instance."""
     return f"{key[0]}#{key[1]}"
+
+
+def _send_to(pid: int, pidfd: int, number: int) -> None:
+    if pidfd == _NO_PIDFD:
+        _send(os.kill, pid, number, str(pid))
+    else:
+        _send(signal.pidfd_send_signal, pidfd, number, str(pid))
 
 
 def _send(call: Callable[[int, int], None], target: int, number: int, what: str) -> None:

@@ -85,6 +85,23 @@ def content(path: str) -> bytes:
     return b"".join(parts)
 
 
+def open_pidfd(pid: int) -> int:
+    """Return a descriptor that is readable once a process has ended; -1: none can be had.
+
+    A filter of system calls, or an old kernel, may refuse it.
+
+    Raises:
+        ProcessLookupError: there is no such process.
+    """
+    try:
+        return os.pidfd_open(pid)
+    except ProcessLookupError:
+        raise
+    except OSError:
+        os.kill(pid, 0)  # a refused call does not tell that the process has ended
+        return -1
+
+
 def inner_pid(pid: int, thread: int = 0) -> int:
     """Return the id of a process, or of one of its threads, in its own pid namespace.
 

@@ -14,6 +14,7 @@ import shutil
 import signal
 import subprocess
 import tempfile
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,8 @@ OLDEST: Final = (4, 2)
 
 #: Seconds for `criu --version`.
 _ANSWER: Final = 10.0
+#: Seconds between two looks for the end of a child without a pidfd.
+_LOOK: Final = 0.01
 _CAP_SYS_ADMIN: Final = 21  # linux/capability.h
 #: Folders that Debian uses for CRIU and that an ordinary user's PATH lacks.
 _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin"
@@ -210,7 +213,14 @@ def _wait_for_end(pid: int, timeout: float) -> bool:
     A pidfd reports the end at once. `Popen.wait` with a timeout polls and returns up to 0.05 s
     late, and the node is frozen for that time.
     """
-    descriptor = os.pidfd_open(pid)
+    try:
+        descriptor = os.pidfd_open(pid)
+    except OSError:  # a filter of system calls refuses it
+        until = time.monotonic() + timeout
+        wanted = os.WEXITED | os.WNOWAIT | os.WNOHANG
+        while (ended := os.waitid(os.P_PID, pid, wanted)) is None and time.monotonic() < until:
+            time.sleep(_LOOK)
+        return ended is not None
     try:
         end = select.poll()
         end.register(descriptor, select.POLLIN)
