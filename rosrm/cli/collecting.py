@@ -17,6 +17,7 @@ from rosrm.client import connecting
 from rosrm.client.log_collection import LogCollector
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.runtime.disk_space import room_for
+from rosrm.runtime.dispositions import handled
 from rosrm.runtime.private_files import make_private_directory
 from rosrm.runtime.state_lock import only_one
 
@@ -51,9 +52,7 @@ def collect(
     """
     stop = threading.Event()
     with ExitStack() as closing:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            before = signal.signal(number, lambda *_: stop.set())
-            closing.callback(signal.signal, number, before)
+        closing.enter_context(handled((signal.SIGINT, signal.SIGTERM), lambda *_: stop.set()))
         _make(directory)
         closing.enter_context(
             only_one(directory, "collector", code="duplicate", remedy="another directory")

@@ -22,6 +22,7 @@ from rosrm.errors import NoMaster, Refused
 from rosrm.model.rows import ProcessRow
 from rosrm.model.values import ProcessSpec
 from rosrm.ros.deferred_signals import signals_deferred
+from rosrm.runtime.dispositions import handled
 from rosrm.wording import standing
 
 #: Seconds in the queue after which the command says why the job waits.
@@ -75,12 +76,8 @@ def _signals(job: _Job) -> Iterator[None]:
         raise KeyboardInterrupt
 
     ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, handle) for number in ending}
-    try:
+    with handled(ending, handle):
         yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @dataclass

@@ -9,7 +9,8 @@ from __future__ import annotations
 import gc
 import signal
 
-signal.signal(signal.SIGINT, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 gc.disable()  # a fifth of the start's CPU time; see `bootstrap.end_start`
 
 import os

@@ -22,6 +22,8 @@ from typing import Final, NoReturn
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.runtime import private_files
+from rosrm.runtime.dispositions import handle
+from rosrm.runtime.memory_file import memory_file
 from rosrm.runtime.settings_check import SettingsSource
 from rosrm.wording import printable
 
@@ -58,12 +60,11 @@ def hand_over(settings: str, source: SettingsSource, parent: int = 0) -> int:
         parent: pid of the parent, if the runtime ends with its parent; 0: it does not.
     """
     plugins = [[one.name, one.target, one.distribution] for one in installed_plugins()]
-    descriptor = os.memfd_create("rosrm-settings", 0)
     handed = {
         "settings": settings, "plugins": plugins, "source": astuple(source), "parent": parent,
     }  # fmt: skip
-    os.write(descriptor, json.dumps(handed).encode())
-    os.lseek(descriptor, 0, os.SEEK_SET)
+    descriptor = memory_file("rosrm-settings", json.dumps(handed).encode())
+    os.set_inheritable(descriptor, True)
     return descriptor
 
 
@@ -118,18 +119,15 @@ def handle_signals(stop: _Handler, reload: _Handler | None = None) -> None:
     """Install the handlers of SIGINT and SIGTERM, which stop, and of SIGHUP.
 
     SIGHUP means that the terminal was closed, and stops, where the process has a controlling
-    terminal. Elsewhere it reloads the settings. A SIGHUP that is ignored, as by `nohup`, stays
-    ignored.
+    terminal. Elsewhere it reloads the settings. A signal that the starter ignores stays ignored.
 
     Args:
         stop: called for each signal to stop.
         reload: called for a SIGHUP without a terminal; None: `stop` is.
     """
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, stop)
-    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:
-        # At the start, because a closed terminal is no controlling terminal any more.
-        signal.signal(signal.SIGHUP, stop if reload is None or has_terminal() else reload)
+    handle((signal.SIGINT, signal.SIGTERM), stop)
+    # At the start, because a closed terminal is no controlling terminal any more.
+    handle((signal.SIGHUP,), stop if reload is None or has_terminal() else reload)
 
 
 def has_terminal() -> bool:

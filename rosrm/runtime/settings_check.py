@@ -8,13 +8,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import IO, Any, Final, Generic, TypeVar
 
 from rosrm import clocks
 from rosrm.model.orders import CHECK_TIMEOUT
+from rosrm.runtime.memory_file import memory_file
 
 Config = TypeVar("Config")
 
@@ -78,8 +78,8 @@ class SettingsCheck(Generic[Config]):
     def _begin(self) -> None:
         source = self._source
         # Files, because the check would wait for a reader of a full pipe.
-        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - `poll` closes it
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - as above
+        self._output = os.fdopen(memory_file("rosrm-check"), "w+b")
+        self._errors = os.fdopen(memory_file("rosrm-check"), "w+b")
         words = [source.role, source.path, "" if source.domain is None else str(source.domain)]
         path_option = ["-P"] if getattr(sys.flags, "safe_path", False) else []
         self._process = subprocess.Popen(
@@ -101,8 +101,7 @@ class SettingsCheck(Generic[Config]):
         if code is None and clocks.boot_time() < self._deadline:
             return
         if code is None:
-            process.kill()
-            process.wait()
+            process.kill()  # its end is not awaited: the file may be on a disk without an answer
         settings, errors = _read(self._output), _read(self._errors)
         self._process = None
         if code is None:
@@ -132,7 +131,6 @@ class SettingsCheck(Generic[Config]):
         """End a check that runs."""
         if self._process is not None:
             self._process.kill()
-            self._process.wait()
 
 
 def _read(file: IO[bytes]) -> str:

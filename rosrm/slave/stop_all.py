@@ -4,12 +4,12 @@ A new slave registers, accepts no work and ends. So the master receives the ends
 as at the end of any slave. Like `rosrm.slave`, this module imports little.
 """
 
-# ruff: noqa: E402 - Ctrl-C must end us without a traceback also during the imports
 from __future__ import annotations
 
 import signal
 
-signal.signal(signal.SIGINT, signal.SIG_DFL)
+if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 import sys
 from dataclasses import replace

@@ -80,8 +80,8 @@ class Part:
     process: subprocess.Popen[bytes]
     log: Path
 
-    def end(self, number: int = signal.SIGINT) -> None:
-        """Send a signal if the part still runs."""
+    def end(self, number: int = signal.SIGTERM) -> None:
+        """Send a signal if the part still runs; SIGINT is ignored by parts of a `rosrm up &`."""
         if self.process.poll() is None:
             self.process.send_signal(number)
 

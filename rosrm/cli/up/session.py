@@ -22,6 +22,7 @@ from rosrm.model.applications import Target
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow
 from rosrm.model.values import ProcessSpec
+from rosrm.runtime.dispositions import handled
 from rosrm.wording import amount, counted, first_line, listed
 
 if TYPE_CHECKING:
@@ -95,12 +96,12 @@ class _Signals:
 
     def __enter__(self) -> Self:
         ending = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        self._before = {number: signal.signal(number, self._handle) for number in ending}
+        self._handled = handled(ending, self._handle)
+        self._handled.__enter__()
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+        self._handled.__exit__(None, None, None)
 
     def hurry_next(self) -> None:
         """Turn the next signal into `_Hurried`, because the end has begun."""

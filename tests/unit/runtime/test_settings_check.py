@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -116,7 +117,12 @@ def test_a_check_that_cannot_be_started_is_a_fault(tmp_path: Path, monkeypatch) 
     path.write_text("host: h\n")
     source, found = SettingsSource("slave", str(path)), list[tuple[Any, str]]()
     check = SettingsCheck(source, HostConfig.from_json, lambda *_: None)
+
+    def refused(_name: str) -> int:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
     with monkeypatch.context() as limited:
+        limited.setattr(os, "memfd_create", refused)
         limited.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
         check.start(lambda *answer: found.append(answer))
     ((config, fault),) = found

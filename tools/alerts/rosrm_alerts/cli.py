@@ -19,6 +19,7 @@ from rosrm import clocks
 from rosrm.cli.options import Domain
 from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError, RosrmError
+from rosrm.runtime.dispositions import handled
 from rosrm.wording import counted, listed
 
 #: Seconds for the delivery of one notice by `try`.
@@ -148,10 +149,5 @@ def _made(sink: ChosenSink, registry: Registry) -> EventSink:
 def _until_stopped() -> Iterator[threading.Event]:
     """Yield an event that SIGINT and SIGTERM set."""
     stop = threading.Event()
-    ends = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, lambda *_: stop.set()) for number in ends]
-    try:
+    with handled((signal.SIGINT, signal.SIGTERM), lambda *_: stop.set()):
         yield stop
-    finally:
-        for number, handler in zip(ends, before, strict=True):
-            signal.signal(number, handler)
