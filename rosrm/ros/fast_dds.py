@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
+import os
 from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
 from typing import Final, Literal
+
+from rosrm.runtime.memory_file import memory_file
 
 #: The first is the one that Fast DDS 2.14 (Jazzy) reads. A value set by the user is not changed.
 _VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
@@ -99,12 +101,14 @@ def bound(environment: MutableMapping[str, str], pace: Pace, interface: str) -> 
 def _applied(
     environment: MutableMapping[str, str], variables: Mapping[str, str], profile: str
 ) -> Iterator[None]:
-    """Apply variables, and a profile with `LEASE` in a temporary file."""
-    with tempfile.NamedTemporaryFile("w", prefix="rosrm-", suffix=".xml") as file:
-        file.write(profile.replace(_BEFORE, f"{_LEASE}{_BEFORE}", 1))
-        file.flush()
-        with _changed(environment, {**variables, _VARIABLES[0]: file.name}):
+    """Apply variables, and a profile with `LEASE`, which needs no room on a disk."""
+    content = profile.replace(_BEFORE, f"{_LEASE}{_BEFORE}", 1).encode()
+    file = memory_file("rosrm-profile", content)
+    try:
+        with _changed(environment, {**variables, _VARIABLES[0]: f"/proc/self/fd/{file}"}):
             yield
+    finally:
+        os.close(file)
 
 
 def _bound_profile(pace: Pace, interface: str) -> str:

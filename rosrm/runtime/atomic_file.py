@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from typing import Final
 
@@ -39,7 +40,9 @@ def replace(
             os.fsync(file)
         os.replace(new, path)
     except OSError:
-        os.close(file)
-        os.unlink(new)
+        with contextlib.suppress(OSError):  # the first fault is the reason
+            os.close(file)
+        with contextlib.suppress(OSError):
+            os.unlink(new)
         raise
     return file

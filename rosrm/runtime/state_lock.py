@@ -14,6 +14,10 @@ from typing import Final, TextIO
 from rosrm.errors import ConfigError, Refused
 from rosrm.runtime.private_files import make_private_directory, open_private
 
+#: Bytes of the pid in the lock, which are written in place: on a full disk the room of a shortened
+#: file may be taken at once.
+_PID_BYTES: Final = 20
+
 _log = logging.getLogger("rosrm")
 
 #: Locks of this process. A plugin may fork, and the child would hold them after the end of this
@@ -75,8 +79,7 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
         except BlockingIOError:
             raise Refused(_refusal(lock, directory, role, remedy), code) from None
         with contextlib.suppress(OSError):  # a full disk: only a refusal's message lacks the pid
-            os.ftruncate(lock.fileno(), 0)
-            os.write(lock.fileno(), str(os.getpid()).encode())
+            os.pwrite(lock.fileno(), str(os.getpid()).ljust(_PID_BYTES).encode(), 0)
         yield
 
 

@@ -26,7 +26,7 @@ from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
-from rosrm.extensions.plugin_calls import TITLES
+from rosrm.extensions.plugin_calls import TITLES, Plugin
 from rosrm.extensions.plugin_deadline import Deadlines
 from rosrm.extensions.process_state import ProcessState
 from rosrm.extensions.registry import Registry
@@ -79,6 +79,7 @@ from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sample, Sampler
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.shutdown import STOP_ALL, Shutdown
+from rosrm.slave.state_disk import StateDisk
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.textfile import HostMetrics, Textfile
 from rosrm.slave.usage import UsageWatch
@@ -251,6 +252,9 @@ class SlaveRuntime:
     def _serve_master(self, max_age: float) -> None:
         """Offer the services of this slave, with those of snapshot replication."""
         config = self._config
+        self._state_disk = StateDisk(
+            self._paths, config.state, lambda fault: self._note_part("state directory", fault)
+        )
         self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
         self._replication = ReplicationService(
             self._snapshots, config.host, config.keep,
@@ -441,6 +445,8 @@ class SlaveRuntime:
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
         self._participant.guard.call(self._settings_check.poll)
+        self._state_disk.look(now)
+        self._note_part("supervisor", self._supervisor.trouble(now))
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
         self._replication.tick(now)
@@ -484,6 +490,19 @@ class SlaveRuntime:
                     failing["probe", resource] = f"probe {report.probe}: {report.reason}"
                 else:
                     failing.pop(("probe", resource), None)
+
+    def _note_part(self, part: str, fault: str) -> None:
+        """Log that a part of the host begins or ceases to fail, and report that to the master."""
+        failing = self._endpoint.failing
+        plugin: Plugin = ("probe", part)
+        if failing.get(plugin, "") == fault:
+            return
+        if fault:
+            failing[plugin] = fault
+        else:
+            del failing[plugin]
+        _log.info("%s: %s", part, fault or "works again")
+        self._endpoint.publish_statuses((), complete=False)
 
     def _note_executors(self, message: str) -> None:
         """Log which migration strategy fails or works again, and report that to the master."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.artifacts.cache import without_directories
 from rosrm.component.link import FAILED, fault_in
 from rosrm.config.settings import LogSettings
@@ -38,12 +40,18 @@ from rosrm.supervisor.client_values import (
     run_limits,
 )
 from rosrm.supervisor.logs import LogLimits
+from rosrm.supervisor.paths import OWN_LOG
 from rosrm.wording import counted
 
 _log = logging.getLogger("rosrm.slave")
 
 #: Seconds for a new supervisor to be ready, or for a busy one to answer.
 _PATIENCE: Final = 30.0
+#: Seconds after which a supervisor counts as one that works; supervisors that may end earlier in a
+#: row before there is a pause, which doubles each time; most seconds of a pause.
+_STEADY: Final = 10.0
+_MOST_BRIEF: Final = 3
+_LONGEST_PAUSE: Final = 60.0
 #: Seconds for which orders may wait before a message to the user.
 _LOGGED_AFTER: Final = 5.0
 _OF_EARLIER_VERSION: Final = (
@@ -86,6 +94,8 @@ class SupervisorLink:
         self._is_shutting_down = False
         self._is_closed = False
         self._logged_waits = False
+        self._brief = 0
+        self._trouble = ("", 0.0)
         self._unanswered: dict[InstanceId, LaunchOrder] = {}
         self._client = SupervisorClient.connect(state, log=self._limits)
 
@@ -176,12 +186,33 @@ class SupervisorLink:
         """Pass the messages of all successive supervisors to the loop, in a thread of its own."""
         try:
             while True:
+                began = clocks.boot_time()
                 self._receive(client)
+                self._slow_down(client, clocks.boot_time() - began)
                 client = self._next()
                 self._post(partial(self._replace, client))
         except SupervisorError as error:
             if not self._is_closed:
                 self._post(partial(self._end, error))
+
+    def _slow_down(self, client: SupervisorClient, lasted: float) -> None:
+        """Pause before the next supervisor if the last ones ended soon after their starts."""
+        self._brief = self._brief + 1 if lasted < _STEADY else 0
+        if self._brief < _MOST_BRIEF:
+            return
+        pause = min(2.0 ** (self._brief - _MOST_BRIEF), _LONGEST_PAUSE)
+        fault = (
+            f"{self._brief} supervisors in a row have ended within {_STEADY:g} s of their start, "
+            f"the last one (pid {client.pid}) after {lasted:.1f} s; the next one starts in "
+            f"{pause:g} s. {self.state / OWN_LOG} may have the reason"
+        )
+        self._trouble = (fault, clocks.boot_time() + pause + _STEADY)
+        time.sleep(pause)
+
+    def trouble(self, now: float) -> str:
+        """Return why supervisors end again and again; "": they do not."""
+        fault, until = self._trouble
+        return fault.replace(str(self.state), "STATE") if now < until else ""
 
     def _receive(self, client: SupervisorClient) -> None:
         """Receive until the supervisor must be replaced; raises `SupervisorError` at the end."""

@@ -6,6 +6,7 @@ import contextlib
 import os
 import socket
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -65,6 +66,11 @@ def log_path(state_directory: Path, instance: InstanceId) -> Path:
     return Path(paths.log_file(str(state_directory), instance.process, instance.number))
 
 
+#: Seconds before the next attempt to connect, after a first and a later supervisor that has ended.
+_FIRST_PAUSE: Final = 0.02
+_LONGEST_PAUSE: Final = 2.0
+
+
 class SupervisorClient:
     """A connection to the supervisor of this host.
 
@@ -120,7 +126,7 @@ class SupervisorClient:
             SupervisorError: there is none and none can be started in time, or it refused.
         """
         state = Path(os.path.abspath(state_directory))
-        deadline = clocks.boot_time() + timeout
+        deadline, pause = clocks.boot_time() + timeout, _FIRST_PAUSE
         while True:
             try:
                 return cls._connect_once(state, start, log, deadline)
@@ -131,6 +137,8 @@ class SupervisorClient:
                 # A dying supervisor still accepts connections for an instant.
                 if clocks.boot_time() > deadline:
                     raise
+                time.sleep(pause)
+                pause = min(2.0 * pause, _LONGEST_PAUSE)
 
     @classmethod
     def _connect_once(

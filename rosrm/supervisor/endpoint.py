@@ -13,6 +13,8 @@ from rosrm.supervisor import own_log, paths
 
 #: First words of the error for a state directory that is served already.
 ANOTHER: Final = "another supervisor"
+#: Bytes of the pid in the lock.
+_PID_BYTES: Final = 20
 #: Least seconds for a connection; a limit of 0 would mean none.
 _SHORTEST: Final = 0.001
 
@@ -76,9 +78,12 @@ def let_go_of_terminal(state: str) -> None:
     os.write(1, b"ready\n")
     path = os.path.join(state, paths.OWN_LOG)
     null = os.open(os.devnull, os.O_RDWR)
-    log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-    if os.fstat(log).st_size > own_log.MOST_BYTES:
-        os.ftruncate(log, 0)
+    try:
+        log = open_private(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+        if os.fstat(log).st_size > own_log.MOST_BYTES:
+            os.ftruncate(log, 0)
+    except OSError:  # a full or read-only disk: better no log than no supervisor
+        log = os.dup(null)
     for source, target in ((null, 0), (null, 1), (log, 2)):
         os.dup2(source, target)
     os.close(null)
@@ -91,12 +96,12 @@ def _lock(state: str) -> None:
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
-        holder = os.read(file, 20).decode().strip() or "unknown"
+        holder = os.read(file, _PID_BYTES).decode().strip() or "unknown"
         raise EndpointError(
             f"{ANOTHER} (pid {holder}) serves the state directory {state}"
         ) from None
-    os.ftruncate(file, 0)
-    os.pwrite(file, f"{os.getpid()}\n".encode(), 0)
+    # In place: on a full disk the room of a shortened file may be taken at once.
+    os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
 
 
 def _bind(state: str) -> socket.socket:

@@ -254,8 +254,9 @@ class InstanceRecord:
         """Pass all lines to the kernel in one write; return False, with `trouble`, if it failed."""
         if not self._waiting:
             return True
-        text = b"".join(self._waiting)
         try:
+            self._open_old()
+            text = b"".join(self._waiting)
             written = os.write(self._file, text)
         except OSError as error:
             self._fail(error.strerror or str(error))
@@ -303,7 +304,6 @@ class InstanceRecord:
         except OSError as error:
             self._fail(error.strerror or str(error))
             self._waiting = waiting
-            self._open_old()
             return
         self._waiting = []
         self._size = len(text)
@@ -316,7 +316,7 @@ class InstanceRecord:
         self._file = file
 
     def _open_old(self) -> None:
-        """Keep using the existing record, behind a tail that may be torn."""
+        """Use the existing record if no other was made, behind a tail that may be torn."""
         if self._file < 0:
             self._file = open_private(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
             self._waiting.insert(0, b"\n")

@@ -254,7 +254,12 @@ class LogFolder:
         self._state = state
         self._numbers: dict[str, list[int]] = {}
         self._left = 0  # processes after the last removal
-        found = map(paths.log_number, os.listdir(paths.log_folder(state)))
+        try:
+            names = os.listdir(paths.log_folder(state))
+        except OSError as error:  # its old logs stay until the next supervisor
+            own_log.write(f"{paths.log_folder(state)} cannot be listed: {error.strerror}")
+            names = []
+        found = map(paths.log_number, names)
         for name, number in sorted(filter(None, found), key=lambda log: log[1]):
             self._place(name, number)
 

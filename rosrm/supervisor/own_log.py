@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import sys
 import time
 from typing import Final
 
@@ -12,13 +11,40 @@ from rosrm.wording import printable
 
 #: Bytes beyond which the log is emptied.
 MOST_BYTES: Final = 1 << 20
+#: Descriptor of the standard error.
+_ERRORS: Final = 2
 
 
 def write(text: str) -> None:
-    """Write one line, with the time by this host's clock."""
-    sys.stderr.write(printable(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {text}\n"))
-    sys.stderr.flush()
-    _empty_if_full()
+    """Write one line, with the time by this host's clock.
+
+    The reports of a full disk come here, so a line that cannot be written is counted instead. The
+    next line that can be written says how many are missing.
+    """
+    global _missing  # noqa: PLW0603 - of the one log
+    lines = f"{_missing} lines before this one are missing: {_why}\n" if _missing else ""
+    line = printable(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {lines}{text}\n")
+    if _written(line):
+        _missing = 0
+        _empty_if_full()
+    else:
+        _missing += 1
+
+
+_missing = 0
+_why = ""
+
+
+def _written(line: str) -> bool:
+    """Write a line; return False if that failed."""
+    global _why  # noqa: PLW0603 - as above
+    try:
+        # Not by `sys.stderr`, whose buffer would repeat a failed line with each further one.
+        os.write(_ERRORS, line.encode(errors="backslashreplace"))
+    except OSError as error:
+        _why = error.strerror or str(error)
+        return False
+    return True
 
 
 def write_fault(text: str) -> None:
@@ -31,5 +57,5 @@ def write_fault(text: str) -> None:
 def _empty_if_full() -> None:
     """Truncate the log beyond its bound; a terminal or pipe has no size."""
     with contextlib.suppress(OSError, ValueError):
-        if os.fstat(sys.stderr.fileno()).st_size > MOST_BYTES:
-            os.ftruncate(sys.stderr.fileno(), 0)
+        if os.fstat(_ERRORS).st_size > MOST_BYTES:
+            os.ftruncate(_ERRORS, 0)

@@ -12,6 +12,7 @@ import os
 import selectors
 import signal
 import socket
+import time
 from collections import deque
 from collections.abc import Callable
 from typing import Final
@@ -55,6 +56,8 @@ LATE_START: Final = 0.5
 RECORD_AGAIN: Final = 1.0
 #: Most seconds of one wait: `epoll` takes 24.8 days at most, and raises an error for more.
 LONGEST_WAIT: Final = 3600.0
+#: Seconds without work after a failure of a part of the loop.
+PAUSE_AFTER_FAULT: Final = 0.1
 #: Seconds that the client has to read the last messages.
 END_PATIENCE: Final = 1.0
 
@@ -128,9 +131,9 @@ class Server:
         if self._timer.descriptor >= 0:
             self._watch(self._timer.descriptor, self._timer.clear)
         self._watch_signals()
-        self._take_over()
+        _guarded(self._take_over)
         while True:
-            self._round()
+            _guarded(self._round)
             if self._leaving:
                 break
             self._take_in(self._timeout())
@@ -143,8 +146,7 @@ class Server:
             # end was noticed first. Its number may even belong to another descriptor by now.
             if self._selector.get_map().get(key.fileobj) is not key:
                 continue
-            call: Callable[[], None] = key.data
-            call()
+            _guarded(key.data)
 
     def _round(self) -> None:
         """Do everything that is due, without waiting."""
@@ -683,6 +685,19 @@ class Server:
 
     def _watch(self, file: socket.socket | Connection | int, call: Callable[[], None]) -> None:
         self._selector.register(file, selectors.EVENT_READ, call)
+
+
+def _guarded(call: Callable[[], None]) -> None:
+    """Call a part of the loop; log a failure of the system that the part does not handle.
+
+    A full or failing disk must not end the parent of all processes. The pause bounds the work if
+    the same failure follows at once.
+    """
+    try:
+        call()
+    except OSError as fault:
+        own_log.write_fault(f"a part of the loop failed: {fault}")
+        time.sleep(PAUSE_AFTER_FAULT)
 
 
 def _open_null() -> int:

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm_criu.engine.criu_log import causes, first_words
 
@@ -216,9 +217,9 @@ def _wait_for_end(pid: int, timeout: float) -> bool:
     try:
         descriptor = os.pidfd_open(pid)
     except OSError:  # a filter of system calls refuses it
-        until = time.monotonic() + timeout
+        until = clocks.awake_time() + timeout
         wanted = os.WEXITED | os.WNOWAIT | os.WNOHANG
-        while (ended := os.waitid(os.P_PID, pid, wanted)) is None and time.monotonic() < until:
+        while (ended := os.waitid(os.P_PID, pid, wanted)) is None and clocks.awake_time() < until:
             time.sleep(_LOOK)
         return ended is not None
     try:
