@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
-from typing import Any
+from typing import Any, Final
 
 import yaml
 
 from rosrm.model.parameters import sections_of
 from rosrm.model.values import ParameterSource
 from rosrm.wording import one_line
+
+#: Most letters of a file.
+_LARGEST: Final = 1 << 24
 
 
 class _RosLoader(yaml.SafeLoader):
@@ -42,10 +45,32 @@ def _untagged(loader: _RosLoader, _tag: str, node: Any) -> Any:
 _RosLoader.add_multi_constructor("tag:yaml.org,2002:python/", _untagged)
 
 
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """Return the letters of a document in which each alias is written out.
+
+    `known`: sizes of nodes that were met before; an alias that contains itself has no end.
+    """
+    if id(node) not in known:
+        known[id(node)] = _LARGEST + 1
+        inner = node.value
+        if isinstance(node, yaml.MappingNode):
+            inner = [one for pair in node.value for one in pair]
+        known[id(node)] = 1 + (
+            len(inner) if isinstance(inner, str) else sum(_size(one, known) for one in inner)
+        )
+    return known[id(node)]
+
+
 def parse_parameters(text: str) -> tuple[ParameterSource, ...]:
     """Return the sections of a ROS parameters file; raises `ValueError` for another document."""
     try:
-        document = yaml.load(text, _RosLoader)  # noqa: S506 - a SafeLoader
+        loader = _RosLoader(text)
+        root = loader.get_single_node()
+        if root is not None and _size(root, {}) > _LARGEST:
+            raise ValueError(f"with its aliases it has more than {_LARGEST} letters")
+        document = None if root is None else loader.construct_document(root)
     except yaml.YAMLError as error:
         raise ValueError(one_line(str(error))) from None
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
     return () if document is None else tuple(sections_of(document))

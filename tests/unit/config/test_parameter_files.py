@@ -30,3 +30,18 @@ def test_another_text_is_refused(text):
     """No object of Python is made from a file."""
     with pytest.raises(ValueError, match=r".+"):
         parse_parameters(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("\n".join(f"a{n + 1}: &a{n + 1} {{x: *a{n}, y: *a{n}}}" for n in range(60)), "more than"),
+        ("a: &a {ros__parameters: *a}", "more than"),
+        ("[" * 5000, "nested too deeply"),
+    ],
+    ids=["aliases of aliases", "an alias of itself", "depth"],
+)
+def test_a_small_file_that_becomes_large_is_refused_at_once(text, said):
+    """Its host would otherwise write parameters without an end."""
+    with pytest.raises(ValueError, match=said):
+        parse_parameters(text if "*a0" not in text else f"a0: &a0 {{}}\n{text}")
