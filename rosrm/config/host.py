@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rosrm.config.checking import validated
 from rosrm.config.documents import Node, Problems, read
+from rosrm.config.first_name import first_name
 from rosrm.config.kinds import check_kind
 from rosrm.config.options import PluginCheck
 from rosrm.config.rules import check_amounts, check_name, settled
@@ -49,8 +50,11 @@ def checked_host(root: Node, path: str | Path, registry: Registry | None) -> Hos
             plugins.check_resources(root.get(key), key, measured)
     problems.raise_any()
     assert config is not None  # else there was a problem
+    state = settled(config.state, path)
+    is_named, has_state = (root.get(key) is not None for key in ("host", "state"))
+    host = first_name(state) if has_state and not is_named else config.host
     return replace(
-        config, state=settled(config.state, path), probes=probes if given else None,
+        config, host=host, state=state, probes=probes if given else None,
         textfile=config.textfile if config.textfile == Path() else settled(config.textfile, path),
         strategies=strategies,
     )  # fmt: skip

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import json
 import os
-import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 from rosrm.config.device_forms import OfferedByKind, with_kinds
+from rosrm.config.first_name import default_host, default_states
 from rosrm.config.markers import (
     NullIsEmpty,
     OneOrMore,
@@ -56,8 +56,13 @@ Scope = Literal["machine", "cgroup", "slice"]
 
 def default_state(name: str, role: str) -> Path:
     """Return the default state directory of a master or slave of a name."""
-    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    return Path(base) / "rosrm" / name / role
+    return default_states() / name / role
+
+
+def place_of_name(settings: HostConfig) -> Path:
+    """Return the directory that keeps the first name of a host."""
+    by_default = settings.state == default_state(settings.host, "slave")
+    return default_states() if by_default else settings.state
 
 
 def default_scope() -> Scope:
@@ -489,7 +494,8 @@ class HostConfig:
     """Settings of a slave (`host.yaml`).
 
     Attributes:
-        host: name of the host; each name has at most one live slave.
+        host: name of the host; each name has at most one live slave. The default is the first name
+            of the machine.
         ros: domain, discovery and transports.
         security: "keys" or "none"; the same as that of the master.
         state: state directory of the slave; by default under XDG_STATE_HOME.
@@ -515,7 +521,7 @@ class HostConfig:
         textfile: directory in which the slave writes metrics of its host; empty: it writes none.
     """
 
-    host: str = field(default_factory=socket.gethostname)
+    host: str = field(default_factory=default_host)
     ros: Ros = field(default_factory=RosSettings)
     security: SecurityMode = field(default_factory=default_security)
     state: Path = Path()

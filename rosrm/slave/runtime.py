@@ -383,6 +383,7 @@ class SlaveRuntime:
             if now >= next_devices:
                 next_devices = now + LOOK_AT_DEVICES
                 guard.call(self._look_at_devices)
+                self._look_at_name()
             guard.call(self._links.turn, now)
             if now >= next_health:
                 next_health = now + LOOK_PERIOD
@@ -411,6 +412,13 @@ class SlaveRuntime:
             self._endpoint.set_devices(self._devices.devices)
         if self._devices.lost:
             self._take(DevicesMissed(self._devices.lost))
+
+    def _look_at_name(self) -> None:
+        """Report another name of this machine, by which commands on it recognize their host."""
+        name = socket.gethostname()
+        if name != self._endpoint.description.hostname:
+            _log.info("this machine is named %r now; its host stays %r", name, self._config.host)
+            self._endpoint.describe_again(self._description())
 
     def _look_at_health(self, now: float) -> None:
         self._events.extend(self._health.look(self._state.watched(), now))

@@ -85,8 +85,9 @@ def slave(
     The slave runs until Ctrl-C, SIGTERM or SIGHUP (a closed terminal), which stop its processes
     too, unless the file has `on_stop: keep`. Without a terminal, SIGHUP reads its file again.
     """
+    from rosrm.config.first_name import keep_name
     from rosrm.config.host import load_host
-    from rosrm.config.settings import HostConfig
+    from rosrm.config.settings import HostConfig, place_of_name
     from rosrm.extensions.registry import Registry
     from rosrm.runtime.state_lock import only_one
 
@@ -105,6 +106,9 @@ def slave(
         registry.default_probes()  # raises if there is none
     remedy = "another `host:` and `state:`"
     with only_one(settings.state, "slave", code="name_taken", remedy=remedy):
+        notice = keep_name(place_of_name(settings), settings.host)
+        if notice:
+            echo(notice, err=True)
         echo(_slave_summary(settings), err=True)
     become("rosrm.slave", settings.to_json(), _source("slave", config, ctx, domain))
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import socket
 import stat
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
+from rosrm.config.first_name import default_host
 from rosrm.errors import ConfigError
 from rosrm.keys import key_files
 from rosrm.keys.cluster import OWN, PrincipalKey, Principals
@@ -76,7 +76,7 @@ def user_report(home: Path, host: str = "") -> KeyReport:
     has_secret = _check_files(report, home)
     found = [
         _report_part(report, home, "commands", "user", ""),
-        _report_part(report, home, "slave", "host", host or socket.gethostname()),
+        _report_part(report, home, "slave", "host", host or default_host()),
     ]
     if not any(found) and not report.faults:
         report.add_fault(
