@@ -11,7 +11,7 @@ from rosrm.core.slave.watches import Observation, Watch
 from rosrm.model.values import InstanceId
 from rosrm.ros.participant import Participant
 from rosrm.ros.slave.graph import GraphWatch
-from rosrm.ros.slave.health import HealthMonitor
+from rosrm.ros.slave.health import HealthMonitor, SimulatedClock
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 from rosrm.supervisor.procfs import read_stat
@@ -37,6 +37,7 @@ class HealthWatch:
         self._launchers = launchers
         self.watches = False
         self._node: Any = None
+        self._clock: SimulatedClock | None = None
         self._monitors: dict[tuple[InstanceId, int], HealthMonitor] = {}
 
     def look(self, watched: Mapping[InstanceId, HeldInstance], now: float) -> list[LookedAt]:
@@ -68,10 +69,12 @@ class HealthWatch:
         if monitor is None:
             monitor = self._monitors[instance, pid] = self._listen(watch, now)
         messages, trouble = monitor.topic(self._sessions.known_as(pid), now)
-        return Observation(stopped, messages, trouble, monitor.state(now))
+        clock = monitor.clock(now)
+        return Observation(stopped, messages, trouble, monitor.state(now), clock)
 
     def _listen(self, watch: Watch, now: float) -> HealthMonitor:
         if self._node is None:
             name = f"{self._participant.node.get_name()}_health"
             self._node = self._participant.unwatched_node(name)
-        return HealthMonitor(self._node, self._graph, watch, now)
+            self._clock = SimulatedClock(self._node)
+        return HealthMonitor(self._node, self._graph, watch, now, self._clock)

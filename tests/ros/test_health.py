@@ -9,6 +9,11 @@ import sys
 from dataclasses import replace
 
 import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
 from std_msgs.msg import Int64, String
 
 from rosrm import clocks
@@ -318,3 +323,28 @@ def test_a_name_that_is_none_harms_nobody(stage) -> None:
     assert "cannot be listened to" in trouble
     assert ear.state(clocks.boot_time() + 60.0) is NoState.NO_ANSWER
     ear.close()
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_the_clock_of_a_node_is_that_which_the_node_uses(stage, simulated) -> None:
+    """The slave asks the node, because a launch or parameter file may set `use_sim_time`."""
+    context = stage.plain.context
+    override = [Parameter("use_sim_time", value=simulated)]
+    node = rclpy.create_node("lidar", context=context, parameter_overrides=override)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    clock = stage.plain.create_publisher(Clock, "/clock", 1)
+    watch = Watch(Health("/scan", 5.0, "", SOON), ("/scan",), parameters=("/lidar/get_parameters",))
+    ear = HealthMonitor(stage.plain, GraphWatch(stage.plain), watch, clocks.boot_time())
+    seen: list[float | None] = []
+
+    def answered() -> bool:
+        clock.publish(Clock(clock=Time(sec=12, nanosec=500_000_000)))
+        executor.spin_once(timeout_sec=0.05)
+        seen.append(ear.clock(clocks.boot_time()))
+        return ear._time._is_simulated is not None and seen[-1] == (12.5 if simulated else None)
+
+    wait_until(answered, "the node has answered", seen=lambda: seen[-3:])
+    ear.close()
+    executor.shutdown()
+    node.destroy_node()

@@ -2,7 +2,8 @@
 
 A check fails only if every observation for longer than the spec's `timeout` found it failing. Only
 time in which the slave observed counts. So a slave that was stopped, or got no CPU, fails no
-instance.
+instance. The rate of a node with simulated time counts by `/clock`: a simulator that is paused, or
+slower than real time, fails no instance.
 """
 
 from __future__ import annotations
@@ -40,6 +41,9 @@ def watch_of(assignment: Assignment) -> Watch | None:
         _names("~/get_state", assignment, "rosservice://") if wanted.lifecycle else (),
         restarts=assignment.spec.restart.when != "never",
         paused=assignment.on_trial or assignment.inactive,
+        parameters=(
+            _names("~/get_parameters", assignment, "rosservice://") if wanted.topic else ()
+        ),
     )
 
 
@@ -147,7 +151,8 @@ class InstanceHealth:
         if lasted > wanted.timeout:
             found = seen.trouble or f"{self._rate.found:.1f} Hz"
             least = f"at least {wanted.rate:g} Hz are required"
-            yield f"{wanted.topic}: {found} for {lasted:.1f} s, {least}"
+            by = " by /clock" if seen.clock is not None else ""
+            yield f"{wanted.topic}: {found} for {lasted:.1f} s{by}, {least}"
 
 
 class _Rate:
@@ -157,7 +162,9 @@ class _Rate:
         amiss: duration for which the rate has been too low.
     """
 
-    __slots__ = ("_counts", "_idle", "_least", "_messages", "_messages_amiss", "_window", "amiss")
+    __slots__ = (
+        "_clock", "_counts", "_idle", "_least", "_messages", "_messages_amiss", "_window", "amiss",
+    )  # fmt: skip
 
     def __init__(self, wanted: Health) -> None:
         self.amiss = _Lasting()
@@ -169,6 +176,7 @@ class _Rate:
         self._counts: deque[tuple[float, int]] = deque()
         self._messages = 0
         self._messages_amiss = 0
+        self._clock: float | None = None
 
     @property
     def found(self) -> float:
@@ -177,6 +185,14 @@ class _Rate:
 
     def look(self, seen: Observation, now: float, passed: float, *, missed: bool) -> None:
         """Count messages; `missed`: so long since the last observation that some may be lost."""
+        before, self._clock = self._clock, seen.clock
+        if seen.clock is not None:
+            began_anew = before is None or seen.clock < before
+            step = 0.0 if before is None else max(0.0, seen.clock - before)
+            passed = min(step, passed) if missed else step
+            now, missed = seen.clock, missed or began_anew
+        elif before is not None:
+            missed = True
         if seen.messages is None or missed:
             self._counts.clear()
         self._messages += seen.messages or 0

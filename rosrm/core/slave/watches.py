@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Final, Literal
 
@@ -50,6 +50,8 @@ class Watch:
         services: absolute names of services that return the lifecycle state; (): no check.
         restarts: the slave restarts the instance, except during a migration.
         paused: the checks are paused, because a shadow or a migrating instance may be silent.
+        parameters: absolute names of services that return whether the node uses simulated time; ():
+            the checks depend on no clock of the node.
     """
 
     checks: Health
@@ -57,6 +59,7 @@ class Watch:
     services: tuple[str, ...] = ()
     restarts: bool = True
     paused: bool = False
+    parameters: tuple[str, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +71,15 @@ class Observation:
         messages: number of messages on its topic; None: the topic cannot be received.
         trouble: why the topic cannot be received; "": it can.
         state: label of its lifecycle state, or the reason why the state is unknown.
+        clock: newest time of `/clock`, for a node with `use_sim_time`; None: its rate counts by the
+            clock of the machine.
     """
 
     stopped: bool = False
     messages: int | None = None
     trouble: str = ""
     state: str | NoState = NoState.NOT_YET
+    clock: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

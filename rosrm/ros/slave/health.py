@@ -37,7 +37,12 @@ _MOST_KEPT: Final = 1000
 class HealthMonitor:
     """Checks the health of one run of one instance; the node is outside every executor."""
 
-    def __init__(self, node: Node, graph: GraphWatch, watch: Watch, now: float) -> None:
+    def __init__(
+        self, node: Node, graph: GraphWatch, watch: Watch, now: float,
+        clock: SimulatedClock | None = None,
+    ) -> None:  # fmt: skip
+        clock = SimulatedClock(node) if clock is None else clock
+        self._time = _TimeMonitor(node, clock, watch.parameters) if watch.topics else None
         self._topic = _TopicMonitor(node, graph, watch) if watch.topics else None
         self._state = _StateMonitor(node, watch, now) if watch.services else None
 
@@ -49,11 +54,75 @@ class HealthMonitor:
         """Return the lifecycle state, or why it is not known."""
         return NoState.NOT_YET if self._state is None else self._state.look(now)
 
+    def clock(self, now: float) -> float | None:
+        """Return the simulated time of the node; None: it counts by the machine's clock."""
+        return None if self._time is None else self._time.look(now)
+
     def close(self) -> None:
         """Destroy the subscription and the clients."""
-        for ear in (self._topic, self._state):
+        for ear in (self._time, self._topic, self._state):
             if ear is not None:
                 ear.close()
+
+
+class SimulatedClock:
+    """Newest time of `/clock`, shared by the monitors of a slave; subscribed at its first use."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._subscription: Any = None
+        self._newest = 0.0
+
+    def now(self) -> float:
+        """Return the simulated time in seconds; 0.0: no simulator has published it."""
+        if self._subscription is None:
+            kind = import_module("rosgraph_msgs.msg").Clock
+            self._subscription = self._node.create_subscription(
+                kind, "/clock", lambda _: None, qos.best_effort(depth=1)
+            )
+        for message, _ in waiting(self._subscription):
+            self._newest = message.clock.sec + 1e-9 * message.clock.nanosec
+        return self._newest
+
+
+class _TimeMonitor:
+    """Finds out whether a node has `use_sim_time`, from the node itself: files may set it too."""
+
+    def __init__(self, node: Node, clock: SimulatedClock, names: Sequence[str]) -> None:
+        self._node, self._clock = node, clock
+        self._services = import_module("rcl_interfaces.srv")
+        self._clients: list[Any] = []
+        self._asked = -math.inf
+        self._is_simulated: bool | None = None  # None: the node has not answered yet
+        for name in names:
+            with contextlib.suppress(Exception):  # an invalid name counts as no answer
+                self._clients.append(node.create_client(self._services.GetParameters, name))
+
+    def look(self, now: float) -> float | None:
+        """Return the simulated time of the node; None: it has none, or has not answered yet."""
+        if self._is_simulated is None:
+            self._ask(now)
+        return self._clock.now() if self._is_simulated else None
+
+    def _ask(self, now: float) -> None:
+        for client in self._clients:
+            with client.handle:
+                header, answer = client.handle.take_response(self._services.GetParameters.Response)
+            if header is not None:
+                self._is_simulated = bool(answer.values and answer.values[0].bool_value)
+                self.close()
+                return
+        if now - self._asked >= _ASK_PERIOD:
+            self._asked = now
+            for client in self._clients:
+                request = self._services.GetParameters.Request(names=["use_sim_time"])
+                with client.handle:
+                    client.handle.send_request(request)
+
+    def close(self) -> None:
+        for client in self._clients:
+            self._node.destroy_client(client)
+        self._clients.clear()
 
 
 class _TopicMonitor:

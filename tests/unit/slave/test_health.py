@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -93,6 +94,50 @@ def test_a_node_has_its_time_once_more_until_it_must_publish() -> None:
     assert node.looks(7.5, trouble="not published as /robot/lidar/scan") == ""
     verdict = node.looks(2.0, trouble="not published as /robot/lidar/scan")
     assert verdict.startswith("unhealthy: ~/scan: not published as /robot/lidar/scan for 4.")
+
+
+class SimulatedNode(Node):
+    """Node with `use_sim_time`, whose topic has a rate in simulated time."""
+
+    clock = 1000.0
+
+    def simulates(self, seconds: float, rate: float, factor: float) -> str:
+        """As `looks`, while simulated time passes by a factor of real time."""
+        for _ in range(round(seconds / 0.2)):
+            before, self.clock = self.clock, self.clock + 0.2 * factor
+            self.now += 0.2
+            published = int(self.clock * rate + 1e-6) - int(before * rate + 1e-6)
+            seen = Observation(messages=published, clock=self.clock)
+            verdict = self.judgement.look(seen, self.now)
+            if verdict:
+                return verdict
+        return ""
+
+
+@pytest.mark.parametrize("factor", [0.4, 1.0, 3.0])
+def test_the_rate_of_a_simulated_node_counts_by_its_clock(factor) -> None:
+    """A slow or fast simulator changes no verdict, which names the clock."""
+    node = SimulatedNode()
+    assert node.simulates(60.0 / factor, 6.0, factor) == ""
+    verdict = node.simulates(20.0 / factor, 0.0, factor)
+    assert re.search(r"0\.0 Hz for [45]\.\d s by /clock, at least 5 Hz", verdict)
+
+
+def test_a_paused_simulator_fails_no_node() -> None:
+    """No simulated time passes, so no message is due; the checks go on with the simulator."""
+    node = SimulatedNode()
+    assert node.simulates(20.0, 6.0, 1.0) == ""
+    assert node.simulates(3600.0, 6.0, 0.0) == ""
+    assert node.simulates(3.0, 0.0, 1.0) == ""
+    assert node.simulates(20.0, 6.0, 1.0) == ""
+
+
+def test_a_simulator_that_is_started_again_fails_no_node() -> None:
+    """Its time begins at zero once more."""
+    node = SimulatedNode()
+    assert node.simulates(20.0, 6.0, 1.0) == ""
+    node.clock = 0.0
+    assert node.simulates(20.0, 6.0, 1.0) == ""
 
 
 def test_a_pause_shorter_than_its_time_is_forgiven() -> None:
