@@ -25,6 +25,8 @@ from rosrm.extensions.process_state import Interrupts
 from rosrm.model.rows import PluginRow
 from rosrm.wording import listed
 
+#: Seconds for the import of a command; nothing but the command waits for it.
+_LOADING: Final = 60.0
 #: Errors of writing the output, which the entry point of the command reports.
 _OF_OUTPUT: Final = (errno.EPIPE, errno.ENOSPC)
 
@@ -56,7 +58,7 @@ def load_command(name: str, addresses: Sequence[PluginAddress]) -> Any:
         return _guarded(typer.main.get_group(alone).commands[name], address)
 
     try:
-        return guarded(load, whom=f"the command {name!r}", hook="import")
+        return guarded(load, whom=f"the command {name!r}", hook="import", seconds=_LOADING)
     except PluginError as fault:
         reason = str(fault)
     return _unusable(

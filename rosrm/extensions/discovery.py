@@ -15,6 +15,7 @@ import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import partial
+from itertools import islice
 from pkgutil import resolve_name
 from types import SimpleNamespace
 from typing import Any, Final, Literal, TypeAlias, TypeVar, get_args, get_type_hints
@@ -239,7 +240,7 @@ def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..
             return [(None, "", f" returned {given}, not a list of {wanted.__name__}")]
         if len(answer) > _MOST_OFFERS:
             return [(None, "", f" returned {len(answer)} offers; allowed: {_MOST_OFFERS}")]
-        checked = [(one, _fault_of(one, wanted)) for one in answer]
+        checked = [(one, _fault_of(one, wanted)) for one in islice(answer, _MOST_OFFERS)]
         return [
             (one, plain_text(getattr(one, "name", ""))[:64], fault and f": {fault}")
             for one, fault in checked

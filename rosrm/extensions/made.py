@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Any, Final
 
 from rosrm.errors import PluginError
@@ -190,7 +191,7 @@ def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
     """Return why a host cannot have these labels of a probe, as a predicate; "": it can."""
     if not isinstance(labels, Mapping):
         return f'has the labels {labels!r:.100}; a mapping is required, as {{"key": "value"}}'
-    for key, value in labels.items():
+    for key, value in islice(labels.items(), _MOST_LABELS + 1):
         if not (key and _is_text(key) and _is_text(value)):
             return (
                 f"has the label {key!r:.100}: {value!r:.100}; printable text of at most "

@@ -16,11 +16,11 @@ from rosrm.extensions.time_limit import CALL_LIMIT, limited
 
 T = TypeVar("T")
 
-#: Share of the limit from which on a call counts as slow.
-_SLOW: Final = 0.1
+#: Share of the limit from which on a call counts as slow: a busy machine delays quick ones, too.
+_SLOW: Final = 0.25
 #: Limits that the slow calls of one plugin may take together; a tenth of the time is given back.
-#: With the default lease of 10 s a plugin holds the loop for less than half of it.
-_MOST_SLOW: Final = 3.0
+#: With the default lease of 10 s a plugin holds the loop for half of it at most.
+_MOST_SLOW: Final = 4.0
 _GIVEN_BACK: Final = 0.1
 #: Longest pause in pauses after the first late call; each further one doubles it.
 _LONGEST: Final = 16.0

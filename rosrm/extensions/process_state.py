@@ -8,11 +8,16 @@ does so once a second for what plugins do in threads.
 from __future__ import annotations
 
 import contextlib
+import gc
 import logging
 import os
 import signal
+import socket
+import sys
 import threading
-from typing import Any, Final
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Final, cast
 
 #: Signals that rosrm handles, or whose default action would end or stop it.
 _SIGNALS: Final = (
@@ -25,13 +30,16 @@ _OF_LIBRARIES: Final = (signal.SIGINT, signal.SIGTERM)
 class ProcessState:
     """The state at the creation of this object, in the main thread."""
 
-    __slots__ = ("_directory", "_disabled", "_handlers", "_level", "_log_handlers", "_umask")
+    __slots__ = (
+        "_directory", "_disabled", "_handlers", "_level", "_log_handlers", "_settings", "_umask",
+    )  # fmt: skip
 
     def __init__(self) -> None:
         root = logging.getLogger()
         self.keep_handlers()
         self._disabled, self._level = root.manager.disable, root.level
         self._log_handlers = root.handlers[:]
+        self._settings = [read() for read, _, _ in _settings()]
         self._directory = _directory()
         self._umask = os.umask(0o077)
         os.umask(self._umask)
@@ -59,6 +67,10 @@ class ProcessState:
         if root.handlers != self._log_handlers:
             root.handlers[:] = self._log_handlers
             changed.append("the handlers of the log")
+        for (read, write, name), before in zip(_settings(), self._settings, strict=False):
+            if read() != before:
+                write(before)
+                changed.append(name)
         if os.umask(self._umask) != self._umask:
             changed.append("the umask")
         if self._directory and _directory() != self._directory:
@@ -66,6 +78,45 @@ class ProcessState:
                 os.chdir(self._directory)
             changed.append("the working directory")
         return changed
+
+
+def _blocked() -> set[signal.Signals]:
+    return cast("set[signal.Signals]", signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+def _block(signals: set[signal.Signals]) -> None:
+    signal.pthread_sigmask(signal.SIG_SETMASK, signals)
+
+
+def _set_filters(filters: Sequence[Any]) -> None:
+    warnings.filters[:] = filters  # type: ignore[index]
+
+
+def _set_collecting(enabled: bool) -> None:
+    (gc.enable if enabled else gc.disable)()
+
+
+#: Further settings: how to read and to write them, and their names.
+_SETTINGS: Final[tuple[tuple[Callable[[], Any], Callable[[Any], Any], str], ...]] = (
+    (_blocked, _block, "the blocked signals"),
+    (sys.getswitchinterval, sys.setswitchinterval, "the switch interval of threads"),
+    (sys.getrecursionlimit, sys.setrecursionlimit, "the recursion limit"),
+    (gc.isenabled, _set_collecting, "the garbage collection"),
+    (lambda: list(warnings.filters), _set_filters, "the filters of warnings"),
+    (socket.getdefaulttimeout, socket.setdefaulttimeout, "the time-out of sockets"),
+)
+
+
+def _settings() -> tuple[tuple[Callable[[], Any], Callable[[Any], Any], str], ...]:
+    """Return the settings; that of numpy comes last, because a plugin may be the first to load it.
+
+    Floating-point errors that raise would end a decision of the core itself.
+    """
+    numpy = sys.modules.get("numpy")
+    if numpy is None or not hasattr(numpy, "geterr"):  # not there, or still being imported
+        return _SETTINGS
+    errors = (numpy.geterr, lambda before: numpy.seterr(**before), "the errors of numpy")
+    return (*_SETTINGS, errors)
 
 
 def _directory() -> str:

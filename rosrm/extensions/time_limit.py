@@ -115,6 +115,7 @@ class _Alarm:
     def __init__(self, guard: FrameType | None, deadline: float) -> None:
         self.interrupt: _Interrupt | None = None
         self.deadline = deadline
+        self._was_forced = False
         self._guard = guard
         self.is_running = True
         self._rung_at = self._logged_at = 0.0
@@ -145,9 +146,10 @@ class _Alarm:
         """Interrupt an overdue call from another thread, as its own alarm was taken or stopped."""
         main = threading.main_thread().ident or 0
         handler = signal.getsignal(signal.SIGALRM)
-        if handler is not _ring:
+        if handler is not _ring or self._was_forced:  # it may also be blocked
             self._next_interrupt()
             interrupt_thread(main)
+        self._was_forced = True
         if callable(handler):  # ends a blocking call; the default action would end the process
             signal.pthread_kill(main, signal.SIGALRM)
 

@@ -33,8 +33,8 @@ def serve(handover: Handover) -> int:
         # Imported only here, so that DDS discovers other participants during the imports.
         from rosrm.master.assembly import new_runtime  # noqa: PLC0415
 
-        with kept_notes(config.state) as notes:
-            return new_runtime(config, handover, participant, notes.found).run()
+        with kept_notes(config.state) as crashes:
+            return new_runtime(config, handover, participant, crashes).run()
 
 
 if __name__ == "__main__":

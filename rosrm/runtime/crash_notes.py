@@ -20,19 +20,23 @@ distribution is tried again, as is every plugin after `plugin-crashes.json` was 
 from __future__ import annotations
 
 import contextlib
+import errno
 import faulthandler
 import json
+import logging
 import mmap
 import os
 import re
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from rosrm.extensions import guard
 from rosrm.extensions.guard import Crash
 from rosrm.runtime.private_files import make_private_directory, open_private
+
+_log = logging.getLogger("rosrm.plugins")
 
 #: Weight from which on a plugin is left out.
 LEFT_OUT: Final = 4
@@ -57,7 +61,8 @@ class CrashNotes:
     """
 
     def __init__(self, directory: Path) -> None:
-        make_private_directory(directory)
+        if not directory.exists():  # the lock of the directory tightens an existing one
+            make_private_directory(directory)
         self._weights = directory / "plugin-crashes.json"
         self._known: dict[str, dict[str, Any]] = _read(self._weights)
         self.found = self._former(directory)
@@ -65,7 +70,9 @@ class CrashNotes:
         self._descriptor = open_private(
             str(self._path), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
         )
-        os.write(self._descriptor, _boot().ljust(_SLOT, b"\0") + _EMPTY * _SLOTS)
+        content = _boot().ljust(_SLOT, b"\0") + _EMPTY * _SLOTS
+        if os.write(self._descriptor, content) < len(content):  # a mapped hole would end us
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._map = mmap.mmap(self._descriptor, _SLOT * (_SLOTS + 1))
         self._free = list(range(_SLOTS, 0, -1))
         self._pid = os.getpid()
@@ -142,7 +149,8 @@ class CrashNotes:
         found = []
         for path in directory.glob(f"{_FILE}.*"):
             pid = path.suffix[1:]
-            if not pid.isdigit() or _runs(int(pid)):
+            # In a container each run may have the same pid.
+            if not pid.isdigit() or (int(pid) != os.getpid() and _runs(int(pid))):
                 continue
             with contextlib.suppress(OSError):
                 content = path.read_bytes()
@@ -161,6 +169,8 @@ class CrashNotes:
             how = "by a crash"
         else:
             proven, how = [one for one in ran if one.startswith(_EXITED)], "by os._exit"
+        if crashed and not proven:  # a crash outside of plugins
+            return []
         if not proven and content[:_SLOT].rstrip(b"\0") != _boot():
             return []
         return [self._blame(one, how if proven else "") for one in proven or ran]
@@ -214,12 +224,20 @@ def _boot() -> bytes:
 
 
 @contextlib.contextmanager
-def kept_notes(directory: Path) -> Iterator[CrashNotes]:
-    """Keep notes of the calls of plugins in a state directory; remove them at an orderly end."""
-    notes = CrashNotes(directory)
+def kept_notes(directory: Path) -> Iterator[Sequence[Crash]]:
+    """Keep notes of the calls of plugins in a state directory; remove them at an orderly end.
+
+    Yields the calls in which former processes have ended. On a full disk there are no notes.
+    """
+    try:
+        notes = CrashNotes(directory)
+    except OSError as fault:
+        _log.warning("no notes of the calls of plugins are kept: %s", fault.strerror)
+        yield ()
+        return
     guard.keep_notes(notes)
     try:
-        yield notes
+        yield notes.found
     finally:
         guard.keep_notes(None)
         notes.close()

@@ -39,9 +39,9 @@ def serve(handover: Handover) -> int:
             fault, oom_score.PROTECTED,
         )  # fmt: skip
     cgroups.delegate()  # first, because the supervisor inherits the group
-    with kept_notes(config.state) as notes:
+    with kept_notes(config.state) as crashes:
         registry = Registry.load(handover.plugins, SLAVE_KINDS)
-        registry.note_crashes(notes.found)
+        registry.note_crashes(crashes)
         return SlaveRuntime(config, registry, wait_for_security(config), handover.source).run()
 
 

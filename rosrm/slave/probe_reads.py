@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any
+from itertools import islice
+from typing import Any, Final
 
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import Probe
@@ -19,6 +20,9 @@ from rosrm.model.values import (
     is_plausible,
 )
 
+#: Most devices of a host, and most processes to which a probe attributes a resource.
+MOST_DEVICES: Final = 256
+MOST_PROCESSES: Final = 100_000
 #: Resource name to pid to amount, in the base unit of the resource.
 UsageByProcess = Mapping[str, Mapping[int, float]]
 
@@ -92,7 +96,9 @@ def read_devices(probe: Probe) -> tuple[Device, ...]:
     answer: object = find()
     if not isinstance(answer, Iterable):
         raise PluginError(f"devices() answered {given(answer)}; a list of Devices is required")
-    devices = tuple(_plain(required(one, Device)) for one in answer)
+    devices = tuple(_plain(required(one, Device)) for one in islice(answer, MOST_DEVICES + 1))
+    if len(devices) > MOST_DEVICES:
+        raise PluginError(f"devices() answered more than {MOST_DEVICES} devices")
     fault = device_fault(devices)
     if fault:
         raise PluginError(f"devices(): {fault}")
@@ -112,8 +118,10 @@ def _mapping(answer: object) -> Mapping[Any, Any]:
 
 def _amounts(resource: str, used: Mapping[int, float]) -> dict[int, float]:
     """Return checked amounts by pid; raise `PluginError` for an invalid one."""
-    amounts = {}
+    amounts: dict[int, float] = {}
     for pid, value in used.items():
+        if len(amounts) >= MOST_PROCESSES:
+            raise PluginError(f"by_process() has more than {MOST_PROCESSES} processes")
         try:
             process, amount = int(pid), float(value)
         except (TypeError, ValueError, OverflowError):

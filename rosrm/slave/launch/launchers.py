@@ -7,6 +7,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any, Final, TypeVar
 
 from rosrm import clocks
@@ -203,7 +204,7 @@ class Launchers:
             if hint is Sequence[int] and isinstance(answer, Sequence):
                 if len(answer) > MOST_MEMBERS:
                     raise PluginError(f"{len(answer)} processes; allowed: {MOST_MEMBERS}")
-                answer = tuple(answer)
+                answer = tuple(islice(answer, MOST_MEMBERS))
             whole(answer, hint, method)
             pids = answer if isinstance(answer, tuple) else (answer,) if hint is int else ()
             wrong = [pid for pid in pids if not 0 < pid <= _HIGHEST_PID]

@@ -7,12 +7,16 @@ import gc
 import logging
 import os
 import signal
+import socket
+import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
@@ -167,6 +171,13 @@ HARM: dict[str, Callable[[], Any]] = {
     "ignored": lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN),
     "umask": lambda: os.umask(0),
     "directory": lambda: os.chdir("/"),
+    "blocked signals": lambda: signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals()),
+    "switch interval": lambda: sys.setswitchinterval(100.0),
+    "recursion": lambda: sys.setrecursionlimit(5_000),
+    "collection": gc.disable,
+    "warnings": lambda: warnings.simplefilter("error"),
+    "sockets": lambda: socket.setdefaulttimeout(0.001),
+    "numpy": lambda: np.seterr(all="raise"),
     "disabled log": lambda: logging.disable(logging.CRITICAL),
     "level of the log": lambda: logging.getLogger().setLevel(logging.CRITICAL),
     "handlers of the log": logging.getLogger().handlers.clear,
@@ -179,7 +190,19 @@ def _state() -> tuple[object, ...]:
     root = logging.getLogger()
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     handlers = [signal.getsignal(one) for one in numbers]
-    return (mask, Path.cwd(), root.manager.disable, root.level, root.handlers[:], handlers)
+    settings = (
+        sys.getswitchinterval(), sys.getrecursionlimit(), gc.isenabled(), warnings.filters[:],
+        socket.getdefaulttimeout(), np.geterr(), signal.pthread_sigmask(signal.SIG_BLOCK, ()),
+    )  # fmt: skip
+    return (
+        settings,
+        mask,
+        Path.cwd(),
+        root.manager.disable,
+        root.level,
+        root.handlers[:],
+        handlers,
+    )
 
 
 @pytest.mark.parametrize("way", [_by_guard, _by_deadline])
@@ -204,6 +227,11 @@ def _endless_without_alarm() -> None:
     _endless()
 
 
+def _endless_without_signals() -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
+    _endless()
+
+
 def _endless_without_timer() -> None:
     signal.setitimer(signal.ITIMER_REAL, 0.0)
     time.sleep(60.0)
@@ -218,7 +246,9 @@ def _own_timer() -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("_own_timer")
-@pytest.mark.parametrize("hang", [_endless, _endless_without_alarm, _endless_without_timer])
+@pytest.mark.parametrize(
+    "hang", [_endless, _endless_without_alarm, _endless_without_timer, _endless_without_signals]
+)
 def test_the_limit_holds_although_a_plugin_takes_its_signal(hang: Callable[[], None]) -> None:
     """A call ends after its limit, also if the plugin replaces the alarm or stops the timer."""
     began = time.monotonic()
@@ -241,7 +271,7 @@ def test_a_plugin_that_is_often_slow_is_not_called_for_a_while() -> None:
 
 def test_quick_calls_begin_no_pause() -> None:
     """A policy that decides quickly may decide as often as the master asks."""
-    calls = PluginCalls(Deadlines(0.3, pause=60.0))
+    calls = PluginCalls(Deadlines(5.0, pause=60.0))
     for _ in range(2_000):
         assert calls.ask(*PLUGIN, "mask", lambda: 7) == 7
 

@@ -71,12 +71,13 @@ def test_a_plugin_of_another_version_is_tried_again(tmp_path: Path) -> None:
     """A new version of its distribution may have mended the fault."""
     for _ in range(2):
         _run(tmp_path, "exit")
-    with kept_notes(tmp_path) as notes:
-        notes.note_versions({"filter 'odd'": "odd 1.0"})
-        assert notes.reason("filter 'odd'", "mask")
-        assert not notes.reason("filter 'odd'", "create")
-        notes.note_versions({"filter 'odd'": "odd 1.1"})
-        assert not notes.reason("filter 'odd'", "mask")
+    notes = CrashNotes(tmp_path)
+    notes.note_versions({"filter 'odd'": "odd 1.0"})
+    assert notes.reason("filter 'odd'", "mask")
+    assert not notes.reason("filter 'odd'", "create")
+    notes.note_versions({"filter 'odd'": "odd 1.1"})
+    assert not notes.reason("filter 'odd'", "mask")
+    notes.close()
 
 
 def test_a_kill_from_outside_is_no_proof(tmp_path: Path) -> None:
@@ -93,17 +94,27 @@ def test_an_orderly_end_leaves_no_file(tmp_path: Path) -> None:
     """A part that ends in order leaves nothing, and its next start blames nobody."""
     assert _run(tmp_path, "none") == ""
     assert list(tmp_path.glob("plugin-*")) == []
-    with kept_notes(tmp_path) as notes:
-        assert notes.found == ()
+    with kept_notes(tmp_path) as crashes:
+        assert crashes == ()
 
 
 def test_a_forked_child_blames_nobody(tmp_path: Path) -> None:
     """A child of a plugin ends by `os._exit`, as those of multiprocessing do."""
-    with kept_notes(tmp_path) as notes:
-        slot = notes.begin("probe 'p'", "read")
-        child = os.fork()
-        if child == 0:
-            os._exit(0)
-        os.waitpid(child, 0)
-        notes.end(slot)
-    assert CrashNotes(tmp_path).found == ()
+    notes = CrashNotes(tmp_path)
+    slot = notes.begin("probe 'p'", "read")
+    child = os.fork()
+    if child == 0:
+        os._exit(0)
+    os.waitpid(child, 0)
+    notes.end(slot)
+    notes.close()
+    again = CrashNotes(tmp_path)
+    again.close()
+    assert again.found == ()
+
+
+def test_a_part_starts_where_no_notes_can_be_kept(tmp_path: Path) -> None:
+    """A directory that takes no file, as on a full disk, keeps no part from starting."""
+    (tmp_path / "file").write_text("")
+    with kept_notes(tmp_path / "file") as crashes:
+        assert crashes == ()
