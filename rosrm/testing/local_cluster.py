@@ -13,6 +13,7 @@ import re
 import signal
 import socket
 import subprocess
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from rosrm.model.rows import HostRow, Listing, ProcessRow
 from rosrm.ros.master_connection import MasterClient
 from rosrm.runtime.bootstrap import command_line, hand_over, interrupts_held
 from rosrm.runtime.settings_check import SettingsSource
+from rosrm.supervisor import procfs
 from rosrm.testing.loopback import settings_on_this_machine
 
 if TYPE_CHECKING:
@@ -79,6 +81,23 @@ class Part:
     name: str
     process: subprocess.Popen[bytes]
     log: Path
+
+    @property
+    def has_ended(self) -> bool:
+        """Return True if it has ended, but for threads that wait for a dead file system."""
+        if self.process.poll() is not None:
+            return True
+        stat = procfs.read_stat(self.process.pid)
+        return stat is None or not stat.alive
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for its end; return False if it still runs after some seconds."""
+        until = clocks.boot_time() + seconds
+        while not self.has_ended:
+            if clocks.boot_time() >= until:
+                return False
+            time.sleep(_LOOK)
+        return True
 
     def end(self, number: int = signal.SIGTERM) -> None:
         """Send a signal if the part still runs; SIGINT is ignored by parts of a `rosrm up &`."""
@@ -161,7 +180,7 @@ class LocalCluster:
         """
         running = [item for item in self.slaves.items() if item[1].process.poll() is None]
         pids = {host: part.process.pid for host, part in running}
-        slave = self.slaves.pop(name).process
+        slave = self.slaves.pop(name)
         at = clocks.wall_time()
         stopped: set[int] = set()
         # A process that is stopped by a signal starts no other, so the loop ends.

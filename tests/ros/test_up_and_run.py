@@ -6,13 +6,14 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import psutil
 import pytest
 
 from rosrm.testing.local_cluster import claim_domain
+from tests.hung_files import hung_files
 from tests.ros.clusters import alive, host, pids_of, wait_until_none
 from tests.ros.test_command_line import Terminal, read_until
 from tests.waiting import PATIENCE, wait_until
@@ -181,3 +182,65 @@ def test_a_terminal_that_lacks_a_character_ends_nothing(terminal) -> None:
             assert process.returncode == 0
         finally:
             process.kill()  # without effect on one that has ended
+
+
+def test_processes_without_a_supervisor_are_ended(terminal) -> None:
+    """Nothing was left to stop them, and `rosrm up` looks before it says that nothing runs."""
+    with started(terminal) as (process, _):
+        pids = [row["pid"] for row in terminal.json("ps")]
+        parts = psutil.Process(process.pid).children(recursive=True)
+        os.kill(process.pid, signal.SIGSTOP)
+        for slave in [one for one in parts if _is_slave(one)]:
+            supervisor = _supervisor_of(slave)
+            for pid in (slave.pid, supervisor):
+                os.kill(pid, signal.SIGKILL)
+        os.kill(process.pid, signal.SIGINT)
+        os.kill(process.pid, signal.SIGCONT)
+        process.communicate(timeout=2 * PATIENCE)
+    assert not any(map(alive, pids))
+
+
+def _supervisor_of(slave: psutil.Process) -> int:
+    (state,) = {Path(one.path).parent for one in slave.open_files() if one.path.endswith(".lock")}
+    return int((state / "supervisor" / "supervisor.lock").read_text())
+
+
+def test_ctrl_c_ends_while_a_file_system_hangs(terminal, tmp_path) -> None:
+    """One process runs from it, another one waits for it, and its parameters are read there."""
+    files = {"program": b"#!/bin/sh\\nexec sleep 1000\\n", "parameters.yaml": b"a: 1\\n"}
+    with hung_files(tmp_path / "hung", files) as hung:
+        text = f"""
+processes:
+  - {{name: waits, command: [sleep, "1000"], working_directory: {hung.place}}}
+  - {{name: reads, command: [sleep, "1000"], ros: true, parameters: [{hung.place}/parameters.yaml]}}
+  - {{name: works, command: sleep 1000}}
+"""
+        hung.hang()
+        work = terminal.file("work.yaml", text)
+        with terminal.start("up", work, start_new_session=True) as process:
+            try:
+                said = read_until(process.stdout.fileno(), "works is running")
+                wait_until(lambda: hung.unanswered > 1, "two calls that wait")
+                os.killpg(process.pid, signal.SIGINT)
+                rest, errors = process.communicate(timeout=2 * PATIENCE)
+            finally:
+                process.kill()
+    assert "ended; nothing runs any more" in rest, said + rest + errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
+def test_a_signal_that_the_starter_ignores_ends_nothing(terminal, number) -> None:
+    """As by `nohup`, or by a shell that starts a program with `&` in a script."""
+    former = signal.signal(number, signal.SIG_IGN)
+    try:
+        starts = started(terminal)
+        process, _ = starts.__enter__()
+    finally:
+        signal.signal(number, former)
+    with ExitStack() as closing:
+        closing.push(starts)
+        os.killpg(process.pid, number)
+        assert {row["state"] for row in terminal.json("ps")} == {"running"}
+        process.send_signal(signal.SIGTERM)
+        rest, _ = process.communicate(timeout=PATIENCE)
+    assert "ended; nothing runs any more" in rest

@@ -8,15 +8,19 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
+from rosrm import clocks
 from rosrm.cli.up import cleaner
 from rosrm.errors import ConfigError, Refused, RosrmError
 from rosrm.model.rows import Listing
 from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.supervisor import procfs
 from rosrm.testing.local_cluster import LocalCluster, Part
+from rosrm.wording import listed
 
 #: Seconds for all hosts to register.
 _REGISTER: Final = 30.0
@@ -25,12 +29,18 @@ _END: Final = 10.0
 #: Seconds for the end of a slave, which stops its processes first. A slave that a plugin holds is
 #: killed then, and the end of its supervisor ends the processes.
 _LONGEST_END: Final = 120.0
+#: Seconds between two looks at what still runs.
+_LOOK: Final = 0.05
 #: Lines of a log that an error shows.
 _LINES: Final = 10
 
 
 class PartEnded(RosrmError):
     """The master or a slave has ended without a request of `rosrm up`; its log may help."""
+
+
+class StillRunning(RosrmError):
+    """A process, or a part of the cluster, does not end."""
 
 
 class UpCluster(LocalCluster):
@@ -74,29 +84,61 @@ class UpCluster(LocalCluster):
         """Stop the slaves with their processes, supervisors that a slave has left, and the master.
 
         Each slave limits the time in which its processes stop.
+
+        Raises:
+            StillRunning: something does not end.
         """
         self._leave()
         for part in self.slaves.values():
             part.end()
         for part in self.slaves.values():
-            try:
-                part.process.wait(_LONGEST_END)
-            except subprocess.TimeoutExpired:  # held by a plugin; the supervisor is stopped below
+            if not part.wait(_LONGEST_END):  # held by a plugin; the supervisor is stopped below
                 part.end(signal.SIGKILL)
-                part.process.wait()
+                part.wait(_END)
         cleaner.stop_supervisors(self.directory)
         if self.master is not None:
             self.master.end()
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                self.master.process.wait(_END)
+            self.master.wait(_END)
             self._kill_master()
+        self._end_others(signal.SIGTERM, signal.SIGKILL)
 
     def kill(self) -> None:
-        """Kill the slaves, the supervisors, all processes and the master."""
+        """Kill the slaves, the supervisors, all processes and the master.
+
+        Raises:
+            StillRunning: something does not end.
+        """
         self._leave()
         for name in list(self.slaves):
             self.switch_off(name)
         self._kill_master()
+        self._end_others(signal.SIGKILL)
+
+    def _end_others(self, *numbers: int) -> None:
+        """End processes whose supervisor was killed; raise `StillRunning` if some do not end."""
+        for number in numbers:
+            for pid in self._left():
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, number)
+            until = clocks.boot_time() + _END
+            while (left := self._left()) and clocks.boot_time() < until:
+                time.sleep(_LOOK)
+            if not left:
+                return
+        names = listed(f"{what} (pid {pid})" for pid, what in left.items())
+        raise StillRunning(
+            f"{names} cannot be killed. A process that waits for a file system without an answer "
+            "ends when that answers, or is unmounted"
+        )
+
+    def _left(self) -> dict[int, str]:
+        """Return the pids of what still runs of this cluster, with the names."""
+        parts = [part for part in (self.master, *self.slaves.values()) if part is not None]
+        left = {part.process.pid: part.name for part in parts if not part.has_ended}
+        for state in self.directory.glob("hosts/*/supervisor"):
+            for mark, found in procfs.find_marked(str(state)).items():
+                left.update((stat.pid, mark.rpartition("#")[0]) for stat in found)
+        return left
 
     def _leave(self) -> None:
         if self._client is not None:
@@ -106,7 +148,7 @@ class UpCluster(LocalCluster):
     def _kill_master(self) -> None:
         if self.master is not None:
             self.master.end(signal.SIGKILL)
-            self.master.process.wait()
+            self.master.wait(_END)
 
 
 def _error_of(part: Part) -> RosrmError:
@@ -153,7 +195,7 @@ def cleaned(directory: Path, *, keep: bool) -> Iterator[None]:
             process.stdin.flush()
         try:
             yield
-        except PartEnded:
+        except (PartEnded, StillRunning):
             process.stdin.write(cleaner.KEEP)
             raise
 
