@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import tempfile
 from collections.abc import Iterator, Mapping, MutableMapping
 from pathlib import Path
-from typing import Final, Literal
-
-from rosrm.runtime.memory_file import memory_file
+from typing import IO, Final, Literal
 
 #: The first is the one that Fast DDS 2.14 (Jazzy) reads. A value set by the user is not changed.
 _VARIABLES: Final = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _PROFILES: Final = Path(__file__).parent / "profiles"
+
+#: File system in memory, which Fast DDS needs for its shared memory anyway.
+_IN_MEMORY: Final = "/dev/shm"  # noqa: S108 - the files have random names and are private
 
 _TRANSPORTS: Final = "FASTDDS_BUILTIN_TRANSPORTS"
 _UDP: Final = "UDPv4"
@@ -101,14 +102,22 @@ def bound(environment: MutableMapping[str, str], pace: Pace, interface: str) -> 
 def _applied(
     environment: MutableMapping[str, str], variables: Mapping[str, str], profile: str
 ) -> Iterator[None]:
-    """Apply variables, and a profile with `LEASE`, which needs no room on a disk."""
-    content = profile.replace(_BEFORE, f"{_LEASE}{_BEFORE}", 1).encode()
-    file = memory_file("rosrm-profile", content)
-    try:
-        with _changed(environment, {**variables, _VARIABLES[0]: f"/proc/self/fd/{file}"}):
+    """Apply variables, and a profile with `LEASE` in a temporary file."""
+    with _temporary_file() as file:
+        file.write(profile.replace(_BEFORE, f"{_LEASE}{_BEFORE}", 1))
+        file.flush()
+        with _changed(environment, {**variables, _VARIABLES[0]: file.name}):
             yield
-    finally:
-        os.close(file)
+
+
+def _temporary_file() -> IO[str]:
+    """Create a temporary file, in memory if possible: the disk may be full, or read-only.
+
+    Fast DDS reads only a file with a path, so none of `memory_file`.
+    """
+    with contextlib.suppress(OSError):
+        return tempfile.NamedTemporaryFile("w", prefix="rosrm-", suffix=".xml", dir=_IN_MEMORY)
+    return tempfile.NamedTemporaryFile("w", prefix="rosrm-", suffix=".xml")
 
 
 def _bound_profile(pace: Pace, interface: str) -> str:
