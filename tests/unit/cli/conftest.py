@@ -103,8 +103,8 @@ class FakeClient:
         self._note("submit", [spec.name for spec in specs])
         return f"{len(specs)} processes were queued"
 
-    def cancel(self, names):
-        self._note("cancel", list(names))
+    def cancel(self, names, *, force=False):
+        self._note("cancel", list(names), *(["force"] if force else []))
         return "cancelled"
 
     def restart(self, names):

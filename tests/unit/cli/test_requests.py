@@ -239,7 +239,7 @@ def test_cancel_wait_ends_when_all_have_ended(rosrm, client, while_asleep):
 def test_cancel_wait_reports_the_end_of_each_process_once(rosrm, client):
     """The summary is not repeated if the reply has the end of each process."""
     client.processes = [process("a", "cancelled"), process("b", "cancelled")]
-    client.cancel = lambda names: f"{len(names)} processes cancelled"
+    client.cancel = lambda names, force: f"{len(names)} processes cancelled"
     result = rosrm("cancel", "a", "b", "--wait")
     assert (result.code, result.out, result.err) == (0, "2 processes cancelled\n", "")
 
