@@ -13,6 +13,7 @@ from rosrm import PositiveSeconds, ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
+from rosrm_resources.paced import Paced
 from rosrm_resources.rate import Rate, check_window
 
 _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
@@ -282,13 +283,12 @@ class SliceCpu:
     ) -> None:
         self.capacity: Final = cores
         self._time = TreeTime(sessions, proc, clock())
-        self._clock = clock
         self._rate = Rate(window, clock(), self._time.seconds(clock()))
+        self._cores = Paced(lambda now: self._rate.update(now, self._time.seconds(now)), clock)
 
     def usage(self) -> float:
         """Return the fraction of the budget in use."""
-        now = self._clock()
-        return self._rate.update(now, self._time.seconds(now)) / self.capacity
+        return self._cores.value() / self.capacity
 
     def close(self) -> None:
         """Close the process files."""

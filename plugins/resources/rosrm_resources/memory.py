@@ -16,6 +16,7 @@ from rosrm import ProbeContext, Sessions
 from rosrm_resources.cgroups import Group, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
+from rosrm_resources.paced import Paced
 
 #: Lines of /proc/PID/status with the memory of a process, in KiB.
 _USED: Final = re.compile(rb"^Rss(?:Anon|Shmem):\s*(\d+)", re.MULTILINE)
@@ -208,13 +209,17 @@ class SliceMemory:
         self.capacity: Final = size
         self._sessions = sessions
         self._files = ProcessFiles(proc, "status", 4096)
+        self._used = Paced(self._sum)
 
     def usage(self) -> float:
         """Return the fraction of the budget in use."""
+        return self._used.value() / self.capacity
+
+    def _sum(self, _now: float) -> float:
         used = 0
         for _, content in self._files.read(self._sessions.pids()):
             used += sum(map(int, _USED.findall(content)))
-        return used * 1024 / self.capacity
+        return used * 1024.0
 
     def close(self) -> None:
         """Close the process files."""
