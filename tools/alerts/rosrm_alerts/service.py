@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Final
 
 from rosrm import (
@@ -87,7 +88,9 @@ class AlertService:
             events = self._new(listing)
             self._position = listing.last_sequence
         situation = None if listing is None else situation_of(listing)
-        changes = self._watch.observe(clocks.wall_time(), situation, map(_seen, events))
+        observed = self._watch.observe(clocks.boot_time(), situation, map(_seen, events))
+        wall = clocks.wall_time()  # for people; a duration by it would end when the clock is set
+        changes = [replace(change, time=wall) for change in observed]
         for change in changes:
             _log.info("alert %s %s: %s", change.alert.name, change.kind, change.message)
         notices = [

@@ -1,0 +1,45 @@
+"""The service that watches for alerts, without a cluster."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+from rosrm import NoMaster
+from rosrm_alerts.conditions import Alert, NoAnswer
+from rosrm_alerts.service import AlertService
+
+
+class Outbox:
+    """An outbox that takes no notice."""
+
+    def active(self):
+        return {}
+
+    def position(self):
+        return None
+
+    def commit(self, *_):
+        return 0
+
+
+def test_a_clock_that_is_set_neither_begins_nor_delays_an_alert(monkeypatch, caplog) -> None:
+    """An alert begins when its condition has held for its time; its notice has the set time."""
+    boot, wall = [1000.0], [1.7e9]
+    monkeypatch.setattr("rosrm.clocks.boot_time", lambda: boot[0])
+    monkeypatch.setattr("rosrm.clocks.wall_time", lambda: wall[0])
+
+    def connect():
+        raise NoMaster("no master answers")
+
+    file = SimpleNamespace(alerts=[Alert("silent", NoAnswer(), lasts=30.0)], forwarded=())
+    service = AlertService(file, {}, Outbox(), connect)
+    begun = []
+    observe = service._watch.observe
+    monkeypatch.setattr(
+        service._watch, "observe", lambda *a: begun.extend(found := observe(*a)) or found
+    )
+    for step in range(40):
+        boot[0] += 1.0
+        wall[0] = 1.7e9 + step + (3600.0 if step % 2 else -3600.0)
+        service._look()
+        assert bool(begun) is (step >= 30), step
