@@ -28,6 +28,12 @@ def awake_time() -> float:
     return time.monotonic()
 
 
+def suspended_time() -> float:
+    """Return the seconds in which this machine was suspended since its start, or a moment less."""
+    boot = boot_time()
+    return boot - awake_time()
+
+
 def wall_time() -> float:
     """Return the unix time, which may be set at any time: for schedules, and for people to read."""
     return time.time()

@@ -47,6 +47,18 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
     assert master._core_now(clock.now) == pytest.approx(100.0 + passed)
 
 
+@pytest.mark.parametrize(("slept", "passed"), [(600.0, 1.0), (0.05, 601.0)])
+def test_a_suspend_of_the_machine_makes_no_host_silent(monkeypatch, slept, passed) -> None:
+    """The master heard nothing while it slept, and must not give up all hosts at its resume."""
+    master = MasterRuntime.__new__(MasterRuntime)
+    master._behind, master._held, master._suspended = 0.0, None, 30.0
+    before = master._core_now(100.0)
+    monkeypatch.setattr("rosrm.clocks.suspended_time", lambda: 30.0 + slept)
+    master._leave_out_suspend()
+    master._leave_out_suspend()
+    assert master._core_now(701.0) - before == pytest.approx(passed)
+
+
 def test_awaited_readings_are_polled_once_in_a_turn(monkeypatch) -> None:
     """Otherwise slaves that report without a pause would delay the beats of the master."""
     polls, events = [], [["registered"], ["asked"], []]
