@@ -103,8 +103,12 @@ def limit_of_one_call(plugin: Plugin, call: Callable[[], T]) -> T:
     return limited(CALL_LIMIT, partial(in_process, titled(*plugin), "", call), lambda: late)
 
 
-def in_process(whom: str, hook: str, call: Callable[[], T]) -> T:
-    """Call a plugin; note whom, and restore what it changed in the process."""
+def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = False) -> T:
+    """Call a plugin; note whom, and restore what it changed in the process.
+
+    Args:
+        often: True: as `whole=False` of `ProcessState`.
+    """
     left_out = "" if _notes is None else _notes.reason(whom, hook)
     if left_out:
         raise PluginError(left_out)
@@ -112,7 +116,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T]) -> T:
     try:
         if threading.current_thread() is not threading.main_thread():
             return _without_interrupt(call)
-        before, interrupts = ProcessState(), Interrupts()
+        before, interrupts = ProcessState(whole=not often), Interrupts()
         try:
             return call()
         except KeyboardInterrupt as fault:
@@ -122,7 +126,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T]) -> T:
         finally:
             interrupts.end()
             changed = before.restore()
-            if changed:
+            if changed and logging.getLogger().handlers:  # a command has no log
                 _log.warning("%s: %s has changed %s, restored now", whom, hook, listed(changed))
     finally:
         if (

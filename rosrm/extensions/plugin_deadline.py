@@ -75,7 +75,8 @@ class Deadlines:
             raise PluginError(account.text)
         late = partial(self._expired, plugin)
         try:
-            answer = limited(self._seconds, partial(in_process, titled(*plugin), "", call), late)
+            guarded = partial(in_process, titled(*plugin), "", call, often=True)
+            answer = limited(self._seconds, guarded, late)
         except TimeoutError as fault:  # name the code that was running at the deadline
             self._accounts[plugin].text = describe_plugin_fault(fault)
             raise

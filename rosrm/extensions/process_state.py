@@ -15,9 +15,11 @@ import signal
 import socket
 import sys
 import threading
-import warnings
-from collections.abc import Callable, Sequence
-from typing import Any, Final, cast
+
+# Without the conversion to enumerations, which takes most of the time of `signal.getsignal`.
+from _signal import getsignal  # type: ignore[import-not-found]
+from collections.abc import Callable
+from typing import Any, Final
 
 #: Signals that rosrm handles, or whose default action would end or stop it.
 _SIGNALS: Final = (
@@ -28,25 +30,35 @@ _OF_LIBRARIES: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 class ProcessState:
-    """The state at the creation of this object, in the main thread."""
+    """The state at the creation of this object, in the main thread.
+
+    Args:
+        whole: True: also what only the kernel knows, by some system calls. A decision may call
+            a plugin hundreds of times, so the runtimes restore this part once a second.
+    """
 
     __slots__ = (
-        "_directory", "_disabled", "_handlers", "_level", "_log_handlers", "_settings", "_umask",
+        "_blocked", "_collects", "_directory", "_disabled", "_handlers", "_level", "_log_handlers",
+        "_settings", "_umask", "_whole",
     )  # fmt: skip
 
-    def __init__(self) -> None:
+    def __init__(self, *, whole: bool = True) -> None:
         root = logging.getLogger()
-        self.keep_handlers()
+        self._whole = whole
+        self.keep_own()
         self._disabled, self._level = root.manager.disable, root.level
         self._log_handlers = root.handlers[:]
         self._settings = [read() for read, _, _ in _settings()]
-        self._directory = _directory()
-        self._umask = os.umask(0o077)
-        os.umask(self._umask)
+        if whole:
+            self._blocked = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+            self._directory = _directory()
+            self._umask = os.umask(0o077)
+            os.umask(self._umask)
 
-    def keep_handlers(self) -> None:
-        """Take the present handlers of signals for the state."""
-        self._handlers = [signal.getsignal(number) for number in _SIGNALS]
+    def keep_own(self) -> None:
+        """Take the present handlers of signals and garbage collection, which rosrm has changed."""
+        self._handlers = [getsignal(number) for number in _SIGNALS]
+        self._collects = gc.isenabled()
 
     def restore(self) -> list[str]:
         """Restore what has changed since; return what it was. No effect in another thread."""
@@ -54,8 +66,8 @@ class ProcessState:
             return []
         changed = []
         for number, handler in zip(_SIGNALS, self._handlers, strict=True):
-            is_other = signal.getsignal(number) != handler
-            if handler is not None and (is_other or number in _OF_LIBRARIES):
+            is_other = getsignal(number) != handler
+            if handler is not None and (is_other or (self._whole and number in _OF_LIBRARIES)):
                 signal.signal(number, handler)
             if is_other:
                 changed.append(f"the handler of {number.name}")
@@ -71,6 +83,16 @@ class ProcessState:
             if read() != before:
                 write(before)
                 changed.append(name)
+        if gc.isenabled() != self._collects:
+            (gc.enable if self._collects else gc.disable)()
+            changed.append("the garbage collection")
+        return changed + (self._restore_of_kernel() if self._whole else [])
+
+    def _restore_of_kernel(self) -> list[str]:
+        changed = []
+        if signal.pthread_sigmask(signal.SIG_BLOCK, ()) != self._blocked:
+            signal.pthread_sigmask(signal.SIG_SETMASK, self._blocked)
+            changed.append("the blocked signals")
         if os.umask(self._umask) != self._umask:
             changed.append("the umask")
         if self._directory and _directory() != self._directory:
@@ -80,29 +102,10 @@ class ProcessState:
         return changed
 
 
-def _blocked() -> set[signal.Signals]:
-    return cast("set[signal.Signals]", signal.pthread_sigmask(signal.SIG_BLOCK, ()))
-
-
-def _block(signals: set[signal.Signals]) -> None:
-    signal.pthread_sigmask(signal.SIG_SETMASK, signals)
-
-
-def _set_filters(filters: Sequence[Any]) -> None:
-    warnings.filters[:] = filters  # type: ignore[index]
-
-
-def _set_collecting(enabled: bool) -> None:
-    (gc.enable if enabled else gc.disable)()
-
-
 #: Further settings: how to read and to write them, and their names.
 _SETTINGS: Final[tuple[tuple[Callable[[], Any], Callable[[Any], Any], str], ...]] = (
-    (_blocked, _block, "the blocked signals"),
     (sys.getswitchinterval, sys.setswitchinterval, "the switch interval of threads"),
     (sys.getrecursionlimit, sys.setrecursionlimit, "the recursion limit"),
-    (gc.isenabled, _set_collecting, "the garbage collection"),
-    (lambda: list(warnings.filters), _set_filters, "the filters of warnings"),
     (socket.getdefaulttimeout, socket.setdefaulttimeout, "the time-out of sockets"),
 )
 
@@ -136,7 +139,7 @@ class Interrupts:
 
     def __init__(self) -> None:
         self.pressed = False
-        self._watched = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        self._watched = getsignal(signal.SIGINT) is signal.default_int_handler
         if self._watched:
             signal.signal(signal.SIGINT, self._note)
 

@@ -72,6 +72,8 @@ _log = logging.getLogger("rosrm.master")
 #: Period of the tick in seconds, which checks readings and deadlines. The cost of a tick does not
 #: depend on the number of readings (docs/decisions/0014).
 _TICK: Final = 0.05
+#: Seconds between two restorations of the state of the process.
+_RESTORE_PERIOD: Final = 1.0
 #: Least seconds to the tick at which the lease of a host ends.
 _SOON: Final = 0.005
 #: Seconds for the discovery of another running master, from the creation of the participant.
@@ -161,7 +163,6 @@ class MasterRuntime:
             opened.callback(self._journal.close)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._reload.hang_up)
-            self._process.keep_handlers()
             opened.callback(self._reload.close)
             security = master_security(config.security)
             self._endpoints = SealedEndpoints(participant, security)
@@ -326,7 +327,8 @@ class MasterRuntime:
     def run(self) -> int:
         """Serve until a signal to stop; returns the exit code."""
         end_start()
-        next_tick = next_beat = self._now()
+        self._process.keep_own()
+        next_tick = next_beat = next_restore = self._now()
         with self._closing:
             while not self._stopping:
                 self._participant.spin(max(0.0, next_tick - self._now()))
@@ -340,6 +342,9 @@ class MasterRuntime:
                 if now >= next_beat:
                     next_beat = now + self._config.control.beat_period
                     self._beat(now)
+                if now >= next_restore:  # what a plugin has changed in a thread
+                    next_restore = now + _RESTORE_PERIOD
+                    self._process.restore()
                 self._take_in(now)
                 next_tick = min(next_tick, now + self._until_loss(now))
                 if self._diagnostics is not None:
@@ -372,7 +377,6 @@ class MasterRuntime:
         self._stopping = self._stopping or signal.Signals(number).name
 
     def _tick(self, now: float) -> None:
-        self._process.restore()  # of what a plugin has changed in a thread
         self._endpoint.events += self._reload.poll()
         if self._grants.has_changed(now):
             self._endpoint.shut_revoked()

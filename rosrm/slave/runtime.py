@@ -216,7 +216,6 @@ class SlaveRuntime:
         return probes.absent
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
-        self._process.keep_handlers()
         self._supervisor = SupervisorLink(
             self._config.state / "supervisor", self._config.logs, post=self._post, take=self._take,
             follow=self._follow_session,
@@ -361,6 +360,7 @@ class SlaveRuntime:
 
     def _serve(self, condition: Callable[[], bool]) -> None:
         end_start()
+        self._process.keep_own()
         now = clocks.boot_time()
         guard = self._participant.guard  # /proc and the ROS graph may fail for a moment
         next_sample = next_usage = next_graph = next_health = next_devices = now

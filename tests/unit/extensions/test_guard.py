@@ -11,7 +11,6 @@ import socket
 import sys
 import threading
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from rosrm.errors import ConfigError, PluginError, SkipPlugin
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.extensions.plugin_deadline import Deadlines
+from rosrm.extensions.process_state import ProcessState
 
 PLUGIN = ("filter", "odd")
 #: Letters of the longest text that any message of rosrm accepts, many times over.
@@ -175,7 +175,6 @@ HARM: dict[str, Callable[[], Any]] = {
     "switch interval": lambda: sys.setswitchinterval(100.0),
     "recursion": lambda: sys.setrecursionlimit(5_000),
     "collection": gc.disable,
-    "warnings": lambda: warnings.simplefilter("error"),
     "sockets": lambda: socket.setdefaulttimeout(0.001),
     "numpy": lambda: np.seterr(all="raise"),
     "disabled log": lambda: logging.disable(logging.CRITICAL),
@@ -191,7 +190,7 @@ def _state() -> tuple[object, ...]:
     numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
     handlers = [signal.getsignal(one) for one in numbers]
     settings = (
-        sys.getswitchinterval(), sys.getrecursionlimit(), gc.isenabled(), warnings.filters[:],
+        sys.getswitchinterval(), sys.getrecursionlimit(), gc.isenabled(),
         socket.getdefaulttimeout(), np.geterr(), signal.pthread_sigmask(signal.SIG_BLOCK, ()),
     )  # fmt: skip
     return (
@@ -205,16 +204,24 @@ def _state() -> tuple[object, ...]:
     )
 
 
-@pytest.mark.parametrize("way", [_by_guard, _by_deadline])
 @pytest.mark.parametrize("harm", HARM)
 def test_what_a_plugin_changes_in_the_process_is_restored(
-    harm: str, way: Any, caplog: pytest.LogCaptureFixture
+    harm: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Signals, log, umask and working directory are as before the call, and a warning says so."""
+    """Signals, log, umask and further settings are as before the call, and a warning says so."""
     before = _state()
-    way(HARM[harm])
+    _by_guard(HARM[harm])
     assert _state() == before
     assert "has changed" in caplog.text
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_what_a_plugin_changes_in_a_decision_is_restored_within_a_second(harm: str) -> None:
+    """What costs system calls is restored by the loop of the part, once a second."""
+    before, state = _state(), ProcessState()
+    _by_deadline(HARM[harm])
+    state.restore()
+    assert _state() == before
 
 
 def _endless() -> None:
