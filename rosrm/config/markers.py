@@ -9,7 +9,7 @@ import json
 from dataclasses import dataclass
 from typing import Any
 
-from rosrm.config.shell_words import shell_words
+from rosrm.config.shell_words import Role, shell_words
 
 
 @dataclass(frozen=True)
@@ -135,10 +135,10 @@ class Words:
     """Annotation of a list of words, or of one text that is split by the rules of a shell.
 
     Attributes:
-        program: the first word is a program.
+        role: of the first word.
     """
 
-    program: bool = False
+    role: Role = "name"
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         """Return the schema that splits a text into words."""
@@ -156,4 +156,4 @@ class Words:
             return tuple(given) if isinstance(given, list) else given
         if "$(find-pkg-" in given:
             raise ValueError(f"{given!r}: write a list of words where a package is named by $(…)")
-        return shell_words(given, program=self.program)
+        return shell_words(given, self.role)

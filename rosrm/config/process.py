@@ -67,7 +67,8 @@ Name = Annotated[str, PlainWord(boolean=False)]
 Labels = Annotated[Mapping[str, Text], NullIsEmpty()]
 _Value = TypeVar("_Value")
 ListOfWords = Annotated[tuple[Text, ...], Words()]
-_CommandLine = Annotated[tuple[Text, ...], Words(program=True)]
+_CommandLine = Annotated[tuple[Text, ...], Words("program")]
+_Arguments = Annotated[tuple[Text, ...], Words("argument")]
 _CpuNumber = Annotated[int, Quantity(high=LARGEST_CPU_NUMBER, whole=True)]
 
 
@@ -272,7 +273,7 @@ class ProcessInFile:
     module: str | None = None
     command: _CommandLine = ()
     prefix: _CommandLine = ()
-    arguments: ListOfWords = ()
+    arguments: _Arguments = ()
     parameters: Annotated[Mapping[str, Any] | tuple[ParameterSource, ...], ParametersInFile()] = (
         field(default_factory=lambda: EMPTY)
     )

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Final
+from typing import Final, Literal
+
+Role = Literal["program", "argument", "name"]
 
 #: Parts of a text: blanks, an escaped character, quoted text, other characters.
 _PART: Final = re.compile(
@@ -29,10 +31,10 @@ _OF_SHELLS: Final = frozenset({
 })  # fmt: skip
 
 
-def shell_words(text: str, *, program: bool) -> tuple[str, ...]:
+def shell_words(text: str, role: Role) -> tuple[str, ...]:
     """Return the words of a text.
 
-    `program`: the first word is a program, and not an argument.
+    `role`: of its first word; the other words of a program are arguments.
 
     Raises:
         ValueError: a quotation is not closed, or a shell would do more than split the text.
@@ -62,27 +64,26 @@ def shell_words(text: str, *, program: bool) -> tuple[str, ...]:
                 f"{text!r} has several lines, and a command has one. Write it on one line or as a "
                 f"list of words, or {_in_a_shell(text)}"
             )
-    found, advice = _syntax(outside, doubled, words, program=program)
+    found, advice = _syntax(outside, doubled, words, role)
     if found:
         raise ValueError(f"{text!r} {found}. Write {_in_a_shell(text)}{advice}")
     return tuple(words)
 
 
-def _syntax(
-    outside: str, doubled: list[str], words: list[str], *, program: bool
-) -> tuple[str, str]:
+def _syntax(outside: str, doubled: list[str], words: list[str], role: Role) -> tuple[str, str]:
     """Return what only a shell would do with a text, and another remedy; "": nothing.
 
     Args:
         outside: the text with `_` in place of all that is quoted.
         doubled: the parts in double quotes.
     """
-    if program and (variable := _VARIABLE.match(outside)):
+    if role == "program" and (variable := _VARIABLE.match(outside)):
         begins = f"begins with {variable[0]!r}, and only a shell sets a variable so"
         return begins, ", or give the variable under `environment`"
-    if program and words and words[0] in _OF_SHELLS:
+    if role == "program" and words and words[0] in _OF_SHELLS:
         return f"begins with {words[0]!r}, a command of shells and no program", ""
-    if found := _SYNTAX.search(outside if program else f" {outside}"):
+    # The host replaces a `~` before a program, and rosrm one before a file.
+    if found := _SYNTAX.search(f" {outside}" if role == "argument" else outside):
         remedy = f", or quote {found[0]!r} to pass it to the program as it is"
         return f"has {found[0]!r} outside quotes, and no shell reads it", remedy
     for part in () if any(map(_SCRIPT.fullmatch, words)) else doubled:

@@ -21,7 +21,7 @@ def test_words_that_are_accepted_are_those_of_a_shell(texts):
     accepted = []
     for text in texts:
         with suppress(ValueError):
-            accepted.append((text, shell_words(f"p {text}", program=True)))
+            accepted.append((text, shell_words(f"p {text}", "program")))
     script = "".join(f"p {text.strip()}\n" for text, _ in accepted)
     prints = "set -f; p() { printf '%s\\0' p \"$@\"; printf END; }\n"
     ran = subprocess.run(

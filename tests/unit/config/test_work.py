@@ -814,3 +814,9 @@ def test_a_variable_of_the_host_stands_in_variables_only(file, refusal):
     assert one(file(ok)).environment == {"P": "/1:{env.P}", "Q": "a$ 5$"}
     said = refusal(load_work, text.replace("KEY", "arguments: ['{env.P}']"))
     assert "arguments: {env.NAME} stands in `environment` only" in said
+
+
+def test_a_home_in_the_first_argument_is_refused_too(refusal):
+    """As in every further one; that of the program is replaced on the host."""
+    said = refusal(load_work, "processes: [{name: a, module: m, arguments: ~/maps}]")
+    assert "'~' outside quotes" in said
