@@ -24,41 +24,44 @@ class EventFeed:
         ask: returns the newest selected events after a sequence, given that and their number.
         after: sequence of the last event that the follower has seen.
         newest: most events of the first request; 0: the default of the master.
+
+    Attributes:
+        after: sequence of the last event that `new` has yielded.
     """
 
     def __init__(self, ask: Callable[[int, int], Listing], after: int, newest: int) -> None:
         self._ask = ask
-        self._after = after
+        self.after = after
         self._newest = newest
         self._known: dict[int, EventRow] = {}
 
     def new(self) -> Iterator[EventRow]:
         """Yield the events since the last request."""
-        listing = self._ask(max(self._after - 1, 0), self._newest)
+        listing = self._ask(max(self.after - 1, 0), self._newest)
         self._newest = _ALL
-        events, last = listing.events, self._known.get(self._after)
-        if listing.last_sequence < self._after or (last is not None and last not in events[:1]):
+        events, last = listing.events, self._known.get(self.after)
+        if listing.last_sequence < self.after or (last is not None and last not in events[:1]):
             is_new, events = self._is_new_in_other_record, self._ask(0, _ALL).events
-            self._after = listing.last_sequence
+            self.after = listing.last_sequence
         else:
             is_new = self._is_new
         for event in events:
             if is_new(event):
                 yield event
-            elif event.sequence != self._after:
+            elif event.sequence != self.after:
                 continue
             self._known[event.sequence] = event
-            self._after = event.sequence
+            self.after = event.sequence
         while len(self._known) > _KNOWN:
             del self._known[min(self._known)]
 
     def _is_new(self, event: EventRow) -> bool:
-        return event.sequence > self._after
+        return event.sequence > self.after
 
     def _is_new_in_other_record(self, event: EventRow) -> bool:
         """Return True unless an event was there before the record lost its newest ones."""
         if not self._known:
-            return False
+            return True
         if event.sequence >= min(self._known):
             return self._known.get(event.sequence) != event
         return event.wall_time > max(one.wall_time for one in self._known.values())

@@ -20,6 +20,7 @@ from rosrm import (
     ProcessRow,
     clocks,
 )
+from rosrm.client.event_feed import EventFeed
 from rosrm.model.notices import notice_of
 from rosrm_alerts.alerts_file import AlertsFile
 from rosrm_alerts.conditions import (
@@ -64,7 +65,9 @@ class AlertService:
     ) -> None:  # fmt: skip
         self._file, self._outbox, self._connect = file, outbox, connect
         self._watch = Watch(file.alerts, outbox.active())
-        self._position = outbox.position()
+        position = outbox.position()
+        self._feed = EventFeed(self._list, position or 0, _MOST_EVENTS)
+        self._is_first = position is None
         self._client: Client | None = None
         self._answers = True
         self._deliveries = {
@@ -82,12 +85,11 @@ class AlertService:
                 stop.wait(PERIOD)
 
     def _look(self) -> None:
-        listing = self._ask()
-        events: Sequence[EventRow] = ()
-        if listing is not None:
-            events = self._new(listing)
-            self._position = listing.last_sequence
-        situation = None if listing is None else situation_of(listing)
+        events = self._ask()
+        situation = None if events is None else situation_of(self._listing)
+        if events is None or self._is_first:  # what had happened before the first listing is old
+            self._is_first = self._is_first and events is None
+            events = ()
         observed = self._watch.observe(clocks.boot_time(), situation, map(_seen, events))
         wall = clocks.wall_time()  # for people; a duration by it would end when the clock is set
         changes = [replace(change, time=wall) for change in observed]
@@ -98,22 +100,27 @@ class AlertService:
             *((sink, notice_of_change(one)) for one in changes for sink in one.alert.to),
         ]
         if notices or changes or events:
-            dropped = self._outbox.commit(notices, self._position, self._watch.active)
+            dropped = self._outbox.commit(notices, self._feed.after, self._watch.active)
             if dropped:
                 _log.error("%d notices were dropped: too many wait for a sink", dropped)
         for sink in {sink for sink, _ in notices}:
             self._deliveries[sink].notify()
 
-    def _ask(self) -> Listing | None:
-        """Return the listing of the cluster; None: the master does not answer."""
+    def _list(self, after: int, newest: int) -> Listing:
+        """Ask for the listing of the cluster, with its events after a sequence."""
         conditions = [alert.condition for alert in self._file.alerts]
+        self._client = self._client or self._connect()
+        self._listing = self._client.list(
+            hosts=any(isinstance(one, (Above, HostLost)) for one in conditions),
+            processes=any(isinstance(one, (InState, Happens)) for one in conditions),
+            events=True, after=after, newest=min(newest, _MOST_EVENTS),
+        )  # fmt: skip
+        return self._listing
+
+    def _ask(self) -> Sequence[EventRow] | None:
+        """Return the events that have not been seen; None: the master does not answer."""
         try:
-            self._client = self._client or self._connect()
-            listing = self._client.list(
-                hosts=any(isinstance(one, (Above, HostLost)) for one in conditions),
-                processes=any(isinstance(one, (InState, Happens)) for one in conditions),
-                events=True, after=self._position or 0, newest=_MOST_EVENTS,
-            )  # fmt: skip
+            events = tuple(self._feed.new())
         except NoMaster as error:
             if self._answers:
                 _log.warning("%s", error)
@@ -122,18 +129,7 @@ class AlertService:
         if not self._answers:
             _log.info("the master answers again")
         self._answers = True
-        return listing
-
-    def _new(self, listing: Listing) -> Sequence[EventRow]:
-        """Return the events that have not been seen; none at the very first listing.
-
-        A sequence below the position belongs to a new journal, whose events are all new.
-        """
-        if self._position is None:
-            return ()
-        if listing.last_sequence < self._position and self._client is not None:
-            return self._client.list(events=True, newest=_MOST_EVENTS).events
-        return listing.events
+        return events
 
     def _disconnect(self) -> None:
         if self._client is not None:
