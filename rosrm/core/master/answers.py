@@ -46,3 +46,9 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
             restarts.note_answer(state, purpose, event, now)
         case ImageRemoval(number):
             images.note_answer(state, number, event, now)
+
+
+def review(state: MasterState, now: float) -> None:
+    """Handle each order of which nothing was reported in time as one without an answer."""
+    for order in state.pending_orders.expired(now):
+        order_answered(state, happened.OrderAnswered.missing(order), now)

@@ -62,6 +62,8 @@ _MOST_STRAYS: Final = 256
 _LARGEST_STATUS: Final = 10_000
 #: Reported states in which nothing of the instance runs, and so the readings do not show it.
 _DOWN: Final = frozenset({InstanceState.STARTING, InstanceState.BACKOFF})
+#: Seconds after the first refusal of a process by a host, after which the host is asked again.
+FIRST_EXCLUSION: Final = 60.0
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
 
@@ -347,7 +349,7 @@ def _ended(
     migration = _note_end(state, instance, end)
     refused = status.state is InstanceState.REFUSED
     if migration is not None and refused and not _recalled(migration, instance):
-        exclude(process, instance.host, status)
+        exclude(process, instance.host, status, now)
     if process.owner != instance.id.number:
         state.record(
             now, EventKind.INSTANCE_ENDED, f"{instance.id} ended on {instance.host.name}"
@@ -417,7 +419,7 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
     elif status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
         _requeue(state, process, host, now, status.message)
     elif status.state is InstanceState.REFUSED:
-        exclude(process, host, status)
+        exclude(process, host, status, now)
         _requeue(state, process, host, now, f"{host.name} cannot run it: {status.message}")
     elif status.succeeded:
         _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
@@ -448,9 +450,10 @@ def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
     return bool(status.exit_code or status.exit_signal)
 
 
-def exclude(process: Process, host: Host, status: InstanceStatus) -> None:
-    """Exclude a host from the placement of a process, because the host cannot run it."""
-    process.excluded[host.name] = status.message or "its slave refused it"
+def exclude(process: Process, host: Host, status: InstanceStatus, now: float) -> None:
+    """Exclude a host from the placement of a process, because the host cannot run it for now."""
+    why = process.excluded[host.name] = status.message or "its slave refused it"
+    process.refusals.note(host.name, why, now, FIRST_EXCLUSION)
     process.demand = None
 
 

@@ -54,7 +54,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import Plain
 from rosrm.model.ledger import Ledger
 from rosrm.model.modes import Mode
-from rosrm.model.orders import Order, ReportInstances
+from rosrm.model.orders import Order, ReportInstances, seconds_of
 from rosrm.model.records import Intent, Record
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.model.sizes import size_of
@@ -284,7 +284,7 @@ class MasterState:
         Args:
             purpose: of the answer; None: the answer is ignored.
         """
-        order_id = self.pending_orders.add(purpose)
+        order_id = self.pending_orders.add(purpose, seconds_of(order))
         self.emit(SendOrder(order_id, host.host_id, order))
         return order_id
 

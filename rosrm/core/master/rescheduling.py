@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
+from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import Failure, Process
 from rosrm.model.values import InstanceState, InstanceStatus, Kind
@@ -53,8 +54,23 @@ def forget_failures(process: Process) -> None:
 def allow_every_host(process: Process) -> None:
     """Let a process start on the hosts again that have refused it or on which it failed."""
     process.excluded.clear()
+    process.refusals.clear()
     process.moves.clear()
     forget_failures(process)
+
+
+def review_refusals(state: MasterState, now: float) -> None:
+    """Let waiting processes be tried again on hosts that have refused them long enough ago."""
+    for name in (*state.queue, *state.set_aside):
+        process = state.processes[name]
+        if not process.excluded:
+            continue
+        waiting = process.refusals.waiting(now)
+        for host in [one for one in process.excluded if one not in waiting]:
+            del process.excluded[host]
+            process.demand = None
+            state.queue.version += 1
+            state.save(process)
 
 
 def failures(process: Process) -> str:

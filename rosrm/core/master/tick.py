@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Final
 
+from rosrm.core.master import answers, restarts
 from rosrm.core.master import events as happened
-from rosrm.core.master import restarts
 from rosrm.core.master.applications import amendments, rollout
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.prefetch import review_slots, waits_too_long
@@ -26,6 +26,7 @@ from rosrm.core.master.migration.reunion import review_separated
 from rosrm.core.master.migration.standby import review_standbys
 from rosrm.core.master.modes import switching
 from rosrm.core.master.recovery import journal_gap
+from rosrm.core.master.rescheduling import review_refusals
 from rosrm.core.master.schedules import review_schedules
 from rosrm.core.master.start_order import review_stops
 from rosrm.core.master.state.backoff import Backoff
@@ -48,6 +49,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     if now - state.reviewed < _REVIEW_EVERY:
         return
     state.reviewed = now
+    answers.review(state, now)
     _ask_for_missing_statuses(state, now)
     for instance in list(state.instances.values()):
         _review_instance(state, instance, now)
@@ -71,6 +73,7 @@ def time_passed(state: MasterState, event: happened.TimePassed, now: float) -> N
     review_rebalancing(state, now)
     replication.review(state, now)
     periodic.review(state, now)
+    review_refusals(state, now)
     reconsider_set_aside(state, now)
     collect_garbage(state)
 

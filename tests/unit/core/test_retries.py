@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from rosrm.core.master import events as happened
 from rosrm.core.master.state.backoff import Backoff, Retries
 from rosrm.core.slave import events
-from rosrm.model.values import InstanceState, MigrationPolicy, ProcessSpec
-from tests.unit.core.cluster import Cluster, Machine, node
+from rosrm.model.orders import AmendInstance
+from rosrm.model.values import InstanceState, Limits, MigrationPolicy, ProcessSpec
+from tests.unit.core.cluster import Cluster, Machine, node, process
 
 
 class Broken(Machine):
@@ -128,3 +130,46 @@ def test_a_user_may_repeat_a_failed_move_at_once() -> None:
     assert cluster.migrate("p", "b").accepted
     play(cluster, 5.0)
     assert cluster.where("p") == ["b"]
+
+
+def test_a_host_that_refused_a_process_is_tried_again_after_a_wait() -> None:
+    """Its disk was full, and the process has waited for another host since."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.79, "cpu": 0.1}))
+    cluster.machines["a"].refuses["p"] = "its artifact was not fetched: no space left on device"
+    cluster.submit(process("p", memory=500))
+    cluster.wait(30.0)
+    assert cluster.phase("p") == "queued"
+    assert len(cluster.assigned()) == 1
+    del cluster.machines["a"].refuses["p"]
+    cluster.wait(40.0)
+    assert cluster.where("p") == ["a"]
+
+
+def test_a_host_that_refuses_a_process_for_ever_is_tried_less_and_less() -> None:
+    """So does one that a former master has excluded."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.79, "cpu": 0.1}))
+    cluster.machines["a"].refuses["p"] = "no such program"
+    cluster.submit(process("p", memory=500))
+    cluster.wait(600.0, tick=0.5)
+    cluster.restart_master()
+    cluster.wait(30.0)
+    assert 3 <= len(cluster.assigned()) <= 6
+
+
+def test_an_order_of_which_nothing_is_reported_ends_without_an_answer() -> None:
+    """A reload does not wait for ever for a slave."""
+    cluster = Cluster("a", "b")
+    request = cluster.request(happened.ReloadRequested(0))
+    cluster.tell(happened.SettingsRead(request))
+    cluster.machines["b"].ordered.clear()
+    cluster.wait(120.0, tick=0.5)
+    assert "b: not reloaded: no answer in time" in cluster.replies[request].message
+
+
+def test_a_refused_change_of_a_running_process_is_repeated_with_back_off() -> None:
+    """Its slave cannot set the limit."""
+    cluster = Cluster(Machine("a", uses=1e9))
+    cluster.apply("nav", process("p", limits=Limits(memory=2e9)))
+    cluster.apply("nav", process("p", limits=Limits(memory=5e8)))
+    cluster.wait(300.0, tick=0.5)
+    assert 5 <= len(cluster.orders(AmendInstance)) <= 12

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.pending_orders import InstanceAmendment
-from rosrm.core.master.state.process import PendingAmendment
+from rosrm.core.master.state.process import Instance, PendingAmendment
 from rosrm.model.orders import NOT_AMENDED, AmendInstance
 from rosrm.model.values import Amendment, ProcessSpec
+
+#: First and longest time, in seconds, until an order without effect is repeated.
+_WAITS: Final = (0.5, 60.0)
 
 
 def review(state: MasterState, now: float) -> None:
@@ -17,14 +23,15 @@ def review(state: MasterState, now: float) -> None:
         owner = state.instances.get(process.owner) if process is not None else None
         if process is None or owner is None:
             del state.unamended[name]  # its next instance starts with the new spec
-        elif name not in state.migrations and _is_due(state, pending, now):
-            pending.ordered_at = now
+        elif name not in state.migrations and _is_due(state, owner, pending, now):
+            pending.backoff.note(now, *_WAITS)
             order = AmendInstance(owner.id, _amendment(process.spec, pending))
             state.send(owner.host, order, InstanceAmendment(owner.id, order.amendment))
 
 
-def _is_due(state: MasterState, pending: PendingAmendment, now: float) -> bool:
-    return now - pending.ordered_at >= state.settings.order_retry
+def _is_due(state: MasterState, owner: Instance, pending: PendingAmendment, now: float) -> bool:
+    is_up = state.hosts.condition_of(owner.host) is HostCondition.UP
+    return is_up and now >= pending.backoff.until
 
 
 def note_answer(state: MasterState, change: InstanceAmendment, event: OrderAnswered) -> None:

@@ -25,9 +25,10 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 from rosrm.model.records import Intent
 
-#: Time-out of a removal, and delay before its retry; seconds.
+#: Time-out of a removal, and first and longest delay before its retry; seconds.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 60.0
+_LONGEST_WAIT: Final = 3600.0
 #: Key of the unwanted images in the journal's table "cluster".
 _KEY: Final = "unwanted_images"
 #: Fields of an unwanted image that are journaled.
@@ -104,11 +105,11 @@ def review(state: MasterState, now: float) -> None:
     """Order hosts that are up to remove unwanted images."""
     for number, one in state.images.unwanted.items():
         host = state.hosts.up(one.host)
-        if host is not None and now >= one.ask_at:
+        if host is not None and now >= one.backoff.until:
             arguments = {"process": one.process, "numbers": list(one.numbers)}
             removal = RunExecutor(one.drop, arguments, _PATIENCE)
             one.order = state.send(host, removal, ImageRemoval(number))
-            one.ask_at = now + _PATIENCE + _ASK_AGAIN
+            one.backoff.until = now + _PATIENCE + _ASK_AGAIN
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
@@ -125,7 +126,7 @@ def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, 
         )  # fmt: skip
         _save(state)
         return
-    one.ask_at = now + _ASK_AGAIN
+    one.backoff.note(now, _ASK_AGAIN, _LONGEST_WAIT)
     state.record(
         now, EventKind.IMAGE_LEFT,
         f"the image of {one.process} was not removed from {one.host}: {event.reason}; retrying",

@@ -31,6 +31,7 @@ from typing import Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import Replication
 from rosrm.core.master.state.process import Process, ProcessPhase
@@ -44,6 +45,8 @@ from rosrm.model.values import InstanceId, SnapshotReport
 
 #: Seconds between two reviews of the same process.
 _LOOK_EVERY: Final = 1.0
+#: Longest time, in seconds, until an order without effect is repeated.
+_LONGEST_WAIT: Final = 60.0
 #: Highest number of drop orders in memory, which prevents that one is repeated at once.
 _REMEMBERED: Final = 10_000
 #: Phases in which the replicas of a process are useless.
@@ -134,8 +137,8 @@ def review(state: MasterState, now: float) -> None:
     """Review a share of the processes with replicas, so that each is reviewed once a second."""
     known = state.replication
     names = known.replicas.processes()
-    if len(known.dropped_at) > _REMEMBERED:
-        known.dropped_at.clear()
+    if len(known.drops) > _REMEMBERED:
+        known.drops.clear()
     share = min(1.0, (now - known.reviewed_at) / _LOOK_EVERY)
     known.reviewed_at = now
     if (state.hosts.condition == HostCondition.EXPECTED).any():
@@ -183,19 +186,20 @@ def _choose(
         choice = keeps.choice if keeps else _current_choice(process, host, replicas)
     if not by_policy and not choice.hosts:
         return  # no other host has a replica, and the policy has chosen none
-    incarnation, is_new = host.description.incarnation, True
+    incarnation, is_new, backoff = host.description.incarnation, True, Backoff()
     if last is not None:
         last.by_policy = by_policy
         is_new = (last.number, last.incarnation) != (process.owner, incarnation)
         is_new = is_new or not _is_same(last.choice, choice)
-        recent = now - last.at < state.settings.order_retry
-        if not is_new and (last.accepted or recent):
+        if not is_new and (last.accepted or now < last.backoff.until):
             return
+        backoff = backoff if is_new else last.backoff
+    backoff.note(now, state.settings.order_retry, _LONGEST_WAIT)
     instance = InstanceId(process.name, process.owner)
     replicate = ReplicateSnapshot(instance, choice.hosts, choice.every)
     order = state.send(host, replicate, Replication(process.name))
     state.replication.last_orders[process.name] = ReplicationOrder(
-        process.owner, incarnation, choice, order, now, by_policy
+        process.owner, incarnation, choice, order, backoff, by_policy
     )
     if is_new and (last is None or set(last.choice.hosts) != set(choice.hosts)):
         where = ", ".join(choice.hosts) or "no other host"
@@ -305,8 +309,8 @@ def _drop(state: MasterState, process: str, name: str, replica: Replica, now: fl
     host = state.hosts.up(name)
     if host is None:
         return  # the host reports its replicas again when it rejoins
-    at = state.replication.dropped_at.get((process, name), -math.inf)
-    if now - at < state.settings.order_retry:
+    backoff = state.replication.drops.setdefault((process, name, replica.number), Backoff())
+    if now < backoff.until:
         return
-    state.replication.dropped_at[process, name] = now
+    backoff.note(now, state.settings.order_retry, _LONGEST_WAIT)
     state.send(host, DropReplica(InstanceId(process, replica.number)), Replication(process))

@@ -32,6 +32,7 @@ from rosrm.core.master.hosts import readoption
 from rosrm.core.master.hosts.fencing import ended_after_loss
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover, handoff
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import (
     DesiredState,
@@ -67,7 +68,10 @@ def _note_phases(state: MasterState, host: Host, now: float) -> None:
 
 
 def mark_rejoined(state: MasterState, host: Host, now: float) -> None:
-    """Restore the phases of a rejoined host's processes from their last statuses."""
+    """Restore the phases of a rejoined host's processes; retry what has failed without it."""
+    for migration in state.migrations.values():
+        if host in (migration.source_host, migration.destination_host):
+            migration.retry = Backoff()
     for instance in state.instances_of(host):
         process = state.owned_by(instance)
         if process is None or process.name in state.migrations:

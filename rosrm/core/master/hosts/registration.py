@@ -20,6 +20,7 @@ from rosrm.core.master.hosts.readings import take_readings
 from rosrm.core.master.master_state import RECORD_PERIOD, MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.recovery.journal_gap import note_seen
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.process import DesiredState, Instance, Process, ProcessPhase
@@ -80,6 +81,9 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
         settle_reservation(state, instance, now)
     _clear_exclusions(state, host)
     state.preemption.forget(host.name)
+    for image in state.images.unwanted.values():
+        if image.host == host.name:
+            image.backoff = Backoff()
     _execute_again(state, host)
     reconsider_set_aside(state, now)
     state.emit(Reply(event.request, host_id=host.host_id))
@@ -173,6 +177,7 @@ def _clear_exclusions(state: MasterState, host: Host) -> None:
 
 def _clear_exclusion(process: Process, host: Host) -> None:
     """Clear the exclusion of a host, unless the process failed there in this run of its slave."""
+    process.refusals.forget(host.name)
     if process.excluded.pop(host.name, None) is not None:
         process.demand = None
     failure = process.failed_on.get(host.name)

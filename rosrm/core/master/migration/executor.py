@@ -33,6 +33,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import blackout, failover, handoff
 from rosrm.core.master.migration.steps import begin, outcome_of, title
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.migration import End, Migration
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.core.master.state.spec_changes import with_in_place
@@ -56,6 +57,9 @@ _COMMITTED: Final = {
     Aim.CHECKPOINT: "the process is now in its image; the checkpoint can no longer be undone",
     Aim.RESTORE: "the process now runs from its image; the restore can no longer be undone",
 }
+
+#: Longest time, in seconds, between two tries of a step that must succeed.
+_LONGEST_WAIT: Final = 30.0
 
 # --- steps ------------------------------------------------------------------------------------
 
@@ -189,7 +193,7 @@ def _to_next_step(state: MasterState, migration: Migration, now: float) -> None:
     """Turn to the next step, or the next undo."""
     migration.index += 1
     migration.begun = False
-    migration.retry_at = now
+    migration.retry = Backoff()
     if migration.stuck:
         _not_stuck(state, migration, now)
     state.save_migration(migration)
@@ -215,7 +219,7 @@ def _failed(state: MasterState, migration: Migration, step: Step, reason: str, n
         _to_next_step(state, migration, now)
         return
     migration.begun = False
-    migration.retry_at = now + state.settings.order_retry
+    migration.retry.note(now, state.settings.order_retry, _LONGEST_WAIT)
     if not migration.stuck:
         migration.stuck = True
         end = "finished" if migration.undo is None else "undone"
@@ -238,7 +242,7 @@ def _begin_undo(state: MasterState, migration: Migration, reason: str, now: floa
 def _go_forward(state: MasterState, migration: Migration, now: float) -> None:
     """Turn forward again, because the destination is active and owns the name."""
     migration.undo, migration.index = None, migration.plan.steps.index(migration.commit)
-    migration.begun, migration.retry_at = False, now
+    migration.begun, migration.retry = False, Backoff()
     if migration.stuck:
         _not_stuck(state, migration, now)
     state.record(

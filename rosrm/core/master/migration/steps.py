@@ -64,7 +64,7 @@ def begin(state: MasterState, migration: Migration, step: Step, now: float) -> b
     """Begin the current step, unless it has begun; return False if it must wait."""
     if migration.begun:
         return True
-    if now < migration.retry_at or _is_expected(state, migration, step):
+    if now < migration.retry.until or _is_expected(state, migration, step):
         return False
     migration.begun, migration.answer = True, None
     migration.deadline = now + _time_limit(state, migration, step)

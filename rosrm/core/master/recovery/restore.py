@@ -7,6 +7,7 @@ from typing import Any
 
 from rosrm.core.master.checkpoint import images
 from rosrm.core.master.lifecycle import (
+    FIRST_EXCLUSION,
     adopt_to_stop,
     cancelled_as,
     note_awaited_ends,
@@ -105,6 +106,8 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     if not item.get("amended", True):
         limits = not item.get("limits_amended", False)  # absent in older journals
         state.unamended[process.name] = PendingAmendment(limits)
+    for host, why in process.excluded.items():
+        process.refusals.note(host, why, now, FIRST_EXCLUSION)
     if not process.is_at_rest:
         process.exit_code, process.ended_on = None, ""
     state.add_process(process)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from math import inf
 
 from rosrm.core.master.commands import OrderId
+from rosrm.core.master.state.backoff import Backoff
 
 
 @dataclass(slots=True)
@@ -18,7 +18,7 @@ class UnwantedImage:
         drop: the executor that removes it.
         numbers: numbers of the dumped instance and of instances that restores of it created.
         order: order of the removal; None: no order awaits its answer.
-        ask_at: time of the next order to remove it.
+        backoff: of the order to remove it.
     """
 
     process: str
@@ -26,7 +26,7 @@ class UnwantedImage:
     drop: str
     numbers: tuple[int, ...]
     order: OrderId | None = None
-    ask_at: float = -inf
+    backoff: Backoff = field(default_factory=Backoff)
 
 
 @dataclass(slots=True)

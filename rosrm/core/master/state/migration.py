@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.events import OrderAnswered
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import Host
 from rosrm.model.codec import fields_from_plain, fields_to_plain, to_plain
 from rosrm.model.devices import HeldDevice
@@ -64,7 +65,7 @@ class Migration:
         deadline: time at which the current step times out.
         begun: the current step has been ordered.
         order: order of the current step; None: the step has none.
-        stuck: a step that must succeed failed; it is retried from `retry_at` on.
+        stuck: a step that must succeed failed; it is retried with a back-off.
         answer: the slave's answer to the order of the current step; None: no answer yet.
         launched: numbers of the instances that were ordered to start.
         suspended: numbers of the instances that their slave was ordered not to restart. A later
@@ -107,7 +108,7 @@ class Migration:
     order_at: float = 0.0
     failure: str = ""
     stuck: bool = False
-    retry_at: float = 0.0
+    retry: Backoff = field(default_factory=Backoff)
     answer: OrderAnswered | None = None
     launched: set[int] = field(default_factory=set)
     suspended: set[int] = field(default_factory=set)

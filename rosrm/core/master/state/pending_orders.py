@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from math import inf
 from typing import Final, Literal
 
 from rosrm.core.master.commands import OrderId
@@ -101,23 +102,53 @@ _SERIES: Final[dict[type, Literal["replication", "capability", "periodic", "link
 }
 
 
+#: Seconds beyond the execution of an order, after which its answer is not expected any more. The
+#: network layer reports a missing answer much sooner.
+_PATIENCE: Final = 60.0
+
+
+@dataclass(slots=True)
+class _Pending:
+    purpose: Purpose
+    seconds: float
+    expires: float = inf
+
+
 class PendingOrders:
-    """Purposes of the unanswered orders of this master; orders of a former master have none."""
+    """Purposes of the unanswered orders of this master; orders of a former master have none.
+
+    The network layer reports each order without an answer. An order of which it reports nothing at
+    all expires, so that nothing waits for its answer for ever.
+    """
 
     def __init__(self) -> None:
-        self._purposes: dict[OrderId, Purpose] = {}
+        self._pending: dict[OrderId, _Pending] = {}
+        self._unstamped: list[OrderId] = []
         self._numbers = Counter[str]()
 
-    def add(self, purpose: Purpose | None = None) -> OrderId:
-        """Return the id of a new order; the answer to an order without a purpose is ignored."""
+    def add(self, purpose: Purpose | None = None, seconds: float = 0.0) -> OrderId:
+        """Return the id of a new order; the answer to an order without a purpose is ignored.
+
+        `seconds`: time for which a slave may execute the order.
+        """
         series = _SERIES.get(type(purpose), "")
         self._numbers[series] += 1
         number = self._numbers[series]
         order: OrderId = (series, number) if series else number
         if purpose is not None:
-            self._purposes[order] = purpose
+            self._pending[order] = _Pending(purpose, seconds)
+            self._unstamped.append(order)
         return order
 
     def pop(self, order: OrderId) -> Purpose | None:
         """Remove an answered order and return its purpose; None: the order has none."""
-        return self._purposes.pop(order, None)
+        pending = self._pending.pop(order, None)
+        return None if pending is None else pending.purpose
+
+    def expired(self, now: float) -> list[OrderId]:
+        """Return the orders whose answer is not expected any more."""
+        for order in self._unstamped:
+            if order in self._pending:
+                self._pending[order].expires = now + self._pending[order].seconds + _PATIENCE
+        self._unstamped.clear()
+        return [order for order, pending in self._pending.items() if now >= pending.expires]

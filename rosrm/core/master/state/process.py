@@ -172,12 +172,12 @@ class PendingAmendment:
 
     Attributes:
         limits: the limits may differ, too.
-        ordered_at: time of the last order; -inf: none.
+        backoff: of the order.
         refusal: why the slave refuses it; "": it does not.
     """
 
     limits: bool = True
-    ordered_at: float = -inf
+    backoff: Backoff = field(default_factory=Backoff)
     refusal: str = ""
 
 
@@ -262,6 +262,7 @@ class Process:
         owner: number of the instance that owns the name; 0: none.
         instances: numbers of all its instances that may still run.
         excluded: name of each host that has refused the process to the reason.
+        refusals: the same hosts, with the time from which on each is tried again.
         failed_on: name of each host that is excluded because the process failed there, in order.
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
             process runs.
@@ -309,6 +310,7 @@ class Process:
     instances: set[int] = field(default_factory=set)
     reason: str = ""
     excluded: dict[str, str] = field(default_factory=dict)
+    refusals: Retries = field(default_factory=Retries)
     failed_on: dict[str, Failure] = field(default_factory=dict)
     born: int = 0
     owned_from: int = 0

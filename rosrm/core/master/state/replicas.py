@@ -12,6 +12,7 @@ from math import inf
 from typing import Final
 
 from rosrm.core.master.commands import OrderId
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import HostCondition, HostTable
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointPolicy
 from rosrm.model.description_checks import name_fault
@@ -100,13 +101,14 @@ class ReplicationOrder:
         by_policy: True: the policy has chosen the hosts since the master started. False: it gives
             no answer, and the hosts are those that already have a replica.
         accepted: the slave has accepted the order.
+        backoff: of the order, until the slave accepts it.
     """
 
     number: int
     incarnation: int
     choice: CheckpointChoice
     order: OrderId
-    at: float
+    backoff: Backoff
     by_policy: bool = True
     accepted: bool = False
 
@@ -120,7 +122,8 @@ class ReplicationState:
         policy_name: name of the policy in the configuration.
         replicas: index of snapshots by process and host.
         last_orders: process name to the last order to its slave.
-        dropped_at: time of the last order to a host to drop its replica of a process.
+        drops: process, host and number of an instance to the back-off of the order to drop the
+            replica of it.
         removed: name of each removed stateful process to a number above those of its instances.
         waiting: processes still to be reviewed in this round.
         reviewed_at: time of the last review.
@@ -130,7 +133,7 @@ class ReplicationState:
     policy_name: str = ""
     replicas: ReplicaIndex = field(default_factory=ReplicaIndex)
     last_orders: dict[str, ReplicationOrder] = field(default_factory=dict)
-    dropped_at: dict[tuple[str, str], float] = field(default_factory=dict)
+    drops: dict[tuple[str, str, int], Backoff] = field(default_factory=dict)
     removed: dict[str, int] = field(default_factory=dict)
     waiting: list[str] = field(default_factory=list)
     reviewed_at: float = -inf
