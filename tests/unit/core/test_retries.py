@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
 from rosrm.core.master import events as happened
 from rosrm.core.master.state.backoff import Backoff, Retries
 from rosrm.core.slave import events
 from rosrm.model.orders import AmendInstance
-from rosrm.model.values import InstanceState, Limits, MigrationPolicy, ProcessSpec
-from tests.unit.core.cluster import Cluster, Machine, node, process
+from rosrm.model.values import InstanceState, Limits, MigrationPolicy, NeighbourRule, ProcessSpec
+from tests.unit.core.cluster import GIB, Cluster, Machine, node, process
 
 
 class Broken(Machine):
@@ -39,7 +42,7 @@ def play(cluster: Cluster, seconds: float) -> int:
     """Let time pass, in which the node is discovered after each start; return its starts on a."""
     pids = set[int]()
     for _ in range(round(seconds / 0.5)):
-        cluster.wait(0.5)
+        cluster.wait(0.5, tick=0.5)
         for machine in cluster.machines.values():
             for instance, program in list(machine.programs.items()):
                 if machine.name == "a":
@@ -173,3 +176,53 @@ def test_a_refused_change_of_a_running_process_is_repeated_with_back_off() -> No
     cluster.apply("nav", process("p", limits=Limits(memory=5e8)))
     cluster.wait(300.0, tick=0.5)
     assert 5 <= len(cluster.orders(AmendInstance)) <= 12
+
+
+# --- property ---------------------------------------------------------------------------------
+
+
+def of_host_a(cluster: Cluster) -> int:
+    """Return how often the process was started on its own host."""
+    return sum(one.kind == "starting" and one.host == "a" for one in cluster.records)
+
+
+@settings(max_examples=10)
+@given(
+    cause=st.sampled_from(["drain", "limit", "rebalance", "preemption", "reunion"]),
+    overlap=st.booleans(),
+    broken=st.sets(st.sampled_from("bcd"), min_size=1),
+    need=st.sampled_from(["measured", "declared"]),
+    lost=st.sets(st.integers(0, 60), max_size=20),
+)
+def test_no_cause_moves_a_process_again_and_again_to_where_it_fails(
+    cause: str, overlap: bool, broken: set[str], need: str, lost: set[int]
+) -> None:
+    """In 200 s, with lost orders, each host is tried a few times; then a good one is used."""
+    cluster = Cluster(
+        Machine("a", memory=4 * GIB), need=need, settle=5.0, cooldown=10.0, hysteresis=1.0,
+        rebalance=cause == "rebalance", rebalance_after=5.0, preemption="move",
+    )  # fmt: skip
+    near = (NeighbourRule("near", ("q",), by="rack"),) if cause == "reunion" else ()
+    spec = node("p", neighbours=near, migration=MigrationPolicy("relaunch", overlap=overlap))
+    cluster.submit(node("q"), spec)
+    cluster.machines["a"].shown["p"] = {"memory": 2 * GIB}
+    for name in "bcd":
+        kind = Broken if name in broken else Machine
+        cluster.add(kind(name, memory=4 * GIB))
+    if cause == "drain":
+        cluster.set_host("a", "drain")
+    elif cause == "limit":
+        cluster.machines["a"].busy["memory"] = 0.4
+    elif cause == "preemption":
+        cluster.submit(process("big", 3000, priority=1, required_labels={}))
+    for at in range(400):
+        if at in lost:
+            for machine in cluster.machines.values():
+                while machine.ordered:
+                    cluster.tell(happened.OrderAnswered.missing(machine.ordered.popleft().order_id))
+        play(cluster, 0.5)
+    begun = sum(
+        one.kind == "migration_begun" and one.process == "p" for one in cluster.records
+    )  # fmt: skip
+    assert begun <= 5 * 3
+    assert of_host_a(cluster) <= 5 * 3

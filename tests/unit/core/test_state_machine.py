@@ -94,7 +94,7 @@ DEVICES = {
 }
 HOST_CHANGES = [
     "cut", "mended", "killed", "killed", "leaves", "stops unreachable", "is detached",
-    "loses power", "loses a poll", "full", "over", "empty", "another supervisor",
+    "loses power", "loses a poll", "full", "over", "empty", "another supervisor", "breaks", "works",
 ]  # fmt: skip
 #: Index of one of the present things; `Play.pick` takes it modulo their number.
 which_one = st.integers(0, 11)
@@ -197,6 +197,8 @@ class Play(RuleBasedStateMachine):
         self.failed: set[str] = set()
         #: Process and host where a start was impossible at some time.
         self.missing: set[tuple[str, str]] = set()
+        #: Hosts on which each program ends soon after its start.
+        self.broken: set[str] = set()
         self.late: list[happened.Event] = []
         self.left: set[int] = set()
         self.cluster.air.left = self.left
@@ -721,16 +723,21 @@ class Play(RuleBasedStateMachine):
             machine.replace_supervisor(self.cluster.now)
         elif what == "loses a poll":
             machine.polled.clear()
+        elif what in ("breaks", "works"):
+            self.broken = {*self.broken, host} if what == "breaks" else self.broken - {host}
         elif what in ("full", "over", "empty"):
             machine.busy["memory"] = {"full": 0.75, "over": 0.85, "empty": 0.1}[what]
         self.flow()
 
     def lose_power(self, machine: Machine) -> None:
         """End everything on the host; restart policies start processes again after the rejoin."""
+        self.end_all(machine, code=-1)
+
+    def end_all(self, machine: Machine, code: int) -> None:
         for instance in list(machine.programs):
             if machine.programs[instance].restart.when == "never":
                 self.failed.add(instance.process)
-            machine.finish(instance.process, self.cluster.now, code=-1)
+            machine.finish(instance.process, self.cluster.now, code=code)
 
     @rule(host=hosts, which=which_one)
     def device_goes_or_returns(self, host: str, which: int) -> None:
@@ -793,6 +800,8 @@ class Play(RuleBasedStateMachine):
                 pass
             for machine in self.cluster.machines.values():
                 self.cluster.deliver(machine)
+                if machine.name in self.broken:
+                    self.end_all(machine, code=1)
 
     @rule(registering=st.lists(hosts, unique=True, max_size=3))
     def master_is_killed(self, registering: list[str]) -> None:
@@ -1023,7 +1032,7 @@ class Play(RuleBasedStateMachine):
         assert {
             (name, one) for name, found in state.start_orders.dependants.items() for one in found
         } == {(name, one) for one, order in orders.items() for name in order.after}
-        assert state.queue.awaiting <= orders.keys()
+        assert state.queue.awaiting <= orders.keys() | state.strays.keys()
         for name in state.start_orders.last_to_stop:
             assert state.processes[name].wanted is DesiredState.CANCEL
 
@@ -1046,6 +1055,7 @@ class Play(RuleBasedStateMachine):
         if not hasattr(self, "cluster"):
             return
         cluster = self.cluster
+        self.broken.clear()
         for machine in cluster.machines.values():
             machine.connected = True
             machine.refuses.clear()
@@ -1063,6 +1073,8 @@ class Play(RuleBasedStateMachine):
         for name in HOSTS:
             cluster.set_host(name, "uncordon")
         self._let_nodes_come_up(40)
+        assert not cluster.state.reports_awaited
+        assert not [one for one in cluster.state.instances.values() if one.restarting]
         calm = {"queued", "set_aside", "running", "finished", "failed", "cancelled"}
         for process in cluster.state.processes.values():
             assert process.phase.value in calm, (process.name, process.phase, process.reason)
@@ -1105,6 +1117,13 @@ class Play(RuleBasedStateMachine):
             assert inventory.devices == DEVICES[host.name]
             assert not inventory.held
         assert not cluster.intents["migration"]
+        self._every_order_ends()
+
+    def _every_order_ends(self) -> None:
+        """Check that no order waits for its answer for ever, whatever was lost."""
+        orders, now = self.cluster.state.pending_orders, self.cluster.now
+        orders.expired(now)
+        assert set(orders.expired(now + 3600.0)) == orders.pending.keys()
 
 
 TestPlay = Play.TestCase

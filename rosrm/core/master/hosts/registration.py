@@ -79,6 +79,8 @@ def host_registered(state: MasterState, event: happened.HostRegistered, now: flo
             lifecycle.stop_instance(state, instance, now)
     for instance in state.instances_of(host):  # restored before the host's capacities were known
         settle_reservation(state, instance, now)
+        if instance.restarting is not None:
+            instance.restarting.backoff = Backoff()  # the former run of the slave may have lost it
     _clear_exclusions(state, host)
     state.preemption.forget(host.name)
     for image in state.images.unwanted.values():

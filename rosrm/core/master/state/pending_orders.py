@@ -119,10 +119,13 @@ class PendingOrders:
 
     The network layer reports each order without an answer. An order of which it reports nothing at
     all expires, so that nothing waits for its answer for ever.
+
+    Attributes:
+        pending: unanswered orders with a purpose.
     """
 
     def __init__(self) -> None:
-        self._pending: dict[OrderId, _Pending] = {}
+        self.pending: dict[OrderId, _Pending] = {}
         self._unstamped: list[OrderId] = []
         self._numbers = Counter[str]()
 
@@ -136,19 +139,19 @@ class PendingOrders:
         number = self._numbers[series]
         order: OrderId = (series, number) if series else number
         if purpose is not None:
-            self._pending[order] = _Pending(purpose, seconds)
+            self.pending[order] = _Pending(purpose, seconds)
             self._unstamped.append(order)
         return order
 
     def pop(self, order: OrderId) -> Purpose | None:
         """Remove an answered order and return its purpose; None: the order has none."""
-        pending = self._pending.pop(order, None)
+        pending = self.pending.pop(order, None)
         return None if pending is None else pending.purpose
 
     def expired(self, now: float) -> list[OrderId]:
         """Return the orders whose answer is not expected any more."""
         for order in self._unstamped:
-            if order in self._pending:
-                self._pending[order].expires = now + self._pending[order].seconds + _PATIENCE
+            if order in self.pending:
+                self.pending[order].expires = now + self.pending[order].seconds + _PATIENCE
         self._unstamped.clear()
-        return [order for order, pending in self._pending.items() if now >= pending.expires]
+        return [order for order, pending in self.pending.items() if now >= pending.expires]
