@@ -54,6 +54,12 @@ def test_apart_comes_first():
     assert choose(view(hosts=near), apart_by="rack").hosts in {("h2",), ("h4",)}
 
 
+def test_a_host_without_the_label_is_not_known_to_be_apart():
+    """A missing label is no other value."""
+    bare = {f"x{n}": {} for n in range(9)}
+    assert choose(view(hosts={**bare, **HOSTS}), apart_by="rack").hosts[0] in HOSTS
+
+
 def test_a_replica_moves_to_a_host_that_is_apart():
     """A host with another label replaces the host with the same label, once it is up."""
     choice = choose(view(replica_hosts=("h2",)), apart_by="rack")

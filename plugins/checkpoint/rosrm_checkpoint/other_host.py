@@ -67,9 +67,13 @@ class OtherHost:
         return near, place, zlib.crc32(f"{process.spec.name}\n{name}".encode())
 
     def _is_near(self, name: str, process: CheckpointView) -> bool:
-        """Return True if a host may be lost together with the process's own host."""
+        """Return True if a host may be lost together with the process's own host.
+
+        A host without the label may be anywhere.
+        """
         label = self._options.apart_by
         if not label:
             return False
         own = process.hosts.get(process.host, {}).get(label)
-        return process.hosts[name].get(label) == own
+        there = process.hosts[name].get(label)
+        return None in (own, there) or there == own
