@@ -16,6 +16,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import failover
 from rosrm.core.master.plugin_failures import note_on_host
 from rosrm.core.master.rescheduling import next_attempt, note_run
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.learned_needs import NO_NEEDS
 from rosrm.core.master.state.migration import End, Migration
@@ -281,14 +282,14 @@ def _handle_unknown_instance(
     state.skip_numbers(status.instance.number)
     if status.instance.number in state.instances:  # desired, but on another host
         if status.state is not InstanceState.STOPPING:
-            state.send(host, StopInstance(status.instance))
+            _stop_untracked(state, host, status.instance, now)
         return
     if sum(state.instances[number].stray for number in host.instances) >= _MOST_STRAYS:
         state.record_seldom(
             host, EventKind.UNASSIGNED_STOPPED, now,
             f"{host.name} reports more than {_MOST_STRAYS} instances that are not assigned to it",
         )  # fmt: skip
-        state.send(host, StopInstance(status.instance))
+        _stop_untracked(state, host, status.instance, now)
         return
     followed = readoption.has_successor(state, status)
     how = "fences it: another instance owns its name" if followed else "stops it"
@@ -304,6 +305,13 @@ def _handle_unknown_instance(
     unknown.at_once = followed
     stop_instance(state, unknown, now)
     state.start_orders.to_review[status.instance.process] = None
+
+
+def _stop_untracked(state: MasterState, host: Host, instance: InstanceId, now: float) -> None:
+    """Order the stop of an instance that the master does not track; its next report repeats it."""
+    state.send(host, StopInstance(instance))
+    later = Backoff(until=now + state.settings.order_retry)
+    state.reports_awaited.setdefault(host.column, later)
 
 
 def adopt_to_stop(

@@ -220,6 +220,31 @@ def test_the_images_of_an_ended_instance_are_removed():
     assert host.sweeps == before + 1
 
 
+def test_a_lost_order_to_remove_images_is_repeated():
+    """No answer to it arrives; the images would stay on the host for ever."""
+    host = Host()
+    cluster = running(Pacing(), host)
+    cluster.wait(12.0)
+    before = host.sweeps
+    cluster.cancel("p")
+    host.machine.ordered = deque(maxlen=0)
+    cluster.wait(5.0)
+    assert host.sweeps == before
+    host.machine.ordered = deque()
+    cluster.wait(60.0)
+    assert host.sweeps == before + 1
+    assert not cluster.state.periodic.of
+
+
+def test_dumps_that_always_fail_pause_the_process_less_and_less():
+    """Each of them freezes the process for a while."""
+    host = Host()
+    host.answer = RuntimeError("no room")
+    cluster = running(Pacing(), host)
+    cluster.wait(1200.0, tick=0.5)
+    assert 6 <= len(host.dumps) <= 14
+
+
 class Unsound(Criu):
     """Strategy that proposes a step changed by a test."""
 

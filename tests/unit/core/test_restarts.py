@@ -183,3 +183,19 @@ def test_the_order_to_report_is_repeated_with_back_off() -> None:
         cluster.tell(happened.TimePassed())
         machine.ordered.clear()
     assert 4 <= len(cluster.orders(ReportInstances)) <= 10
+
+
+def test_the_stop_of_an_instance_of_another_host_is_repeated_until_it_has_ended() -> None:
+    """A journal that lost its end gave the number of a running instance to another process."""
+    cluster = Cluster("a", "b").with_processes(process("p"))
+    (host,) = cluster.where("p")
+    other = cluster.machines[{"a": "b", "b": "a"}[host]]
+    assignment = cluster.machines[host].programs[cluster.machines[host].find("p")].assignment
+    other.connected = False
+    other.tell(events.AssignmentsReceived((assignment,)), cluster.now)
+    other.connected = True
+    while other.status_batches:
+        cluster.tell(other.status_batches.popleft())
+    other.ordered.clear()
+    cluster.wait(10.0)
+    assert cluster.where("p") == [host]

@@ -19,9 +19,11 @@ from math import inf
 from typing import Any, Final
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.events import OrderOutcome
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import Rejected
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.pending_orders import PeriodicCheckpoint
 from rosrm.core.master.state.periodic import Dumped
@@ -39,6 +41,8 @@ from rosrm.wording import size
 _LOOK_EVERY: Final = 1.0
 #: Time-out of a removal, in seconds.
 _PATIENCE: Final = 30.0
+#: First and longest time, in seconds, after a failure.
+_WAITS: Final = (1.0, 600.0)
 #: Upper bound of numbers in results, because JSON may hold integers that no float can.
 _MOST: Final = 1e18
 
@@ -50,7 +54,7 @@ def review(state: MasterState, now: float) -> None:
         return
     known.reviewed_at = now
     for number in [number for number in known.of if number not in state.instances]:
-        if _remove(state, number, known.of[number]):
+        if _remove(state, number, known.of[number], now):
             del known.of[number]
     if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
@@ -59,9 +63,14 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
-    """Note the answer to the order of an instance's dump."""
+    """Note the answer to the order of an instance's dump, or to that to remove its images."""
     dumped = state.periodic.of.get(number)
-    if dumped is not None and dumped.order == event.order:
+    if dumped is None:
+        return
+    if dumped.removal == event.order:
+        if event.outcome in (OrderOutcome.ACCEPTED, OrderOutcome.BAD_RESULT):  # the executor ran
+            del state.periodic.of[number]
+    elif dumped.order == event.order:
         _note(state, dumped, event, now)
 
 
@@ -97,7 +106,7 @@ def _review(state: MasterState, process: Process, now: float) -> None:
     pace = _pace(state, process, strategy, host, dumped)
     if isinstance(pace, Rejected):
         _record_trouble(state, dumped, pace.reason, now)
-    elif pace is not None and now >= dumped.since + pace:
+    elif pace is not None and now >= max(dumped.since + pace, dumped.backoff.until):
         trouble = capabilities.fault(state, name, host, host)
         if trouble:
             _record_trouble(state, dumped, trouble, now)
@@ -192,8 +201,10 @@ def _order(
 def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now: float) -> None:
     dumped.order, dumped.since = None, now
     if not event.accepted:
+        dumped.backoff.note(now, *_WAITS)
         _record_trouble(state, dumped, event.reason, now)
         return
+    dumped.backoff = Backoff()
     result = event.result or {}
     dumped.size = int(_number(result.get("size")))
     parts = result.get("seconds")
@@ -227,8 +238,8 @@ def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float
     )  # fmt: skip
 
 
-def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
-    """Order the removal of an instance's images; return False if it must be retried.
+def _remove(state: MasterState, number: int, dumped: Dumped, now: float) -> bool:
+    """Order the removal of an instance's images; return False until none is left to order.
 
     The slave of a host that is not up removes them when it registers.
     """
@@ -239,7 +250,12 @@ def _remove(state: MasterState, number: int, dumped: Dumped) -> bool:
         dumped.discard = _discard_of(state, dumped.strategy)
     if isinstance(dumped.discard, Rejected):
         return False
-    if dumped.discard:
+    if not dumped.discard:
+        return True
+    if dumped.removal is None:
+        dumped.backoff = Backoff()
+    if now >= dumped.backoff.until:
+        dumped.backoff.note(now, _PATIENCE + _WAITS[0], _WAITS[1])
         remove = RunExecutor(dumped.discard, timeout=_PATIENCE)
-        state.send(host, remove, PeriodicCheckpoint(number))
-    return True
+        dumped.removal = state.send(host, remove, PeriodicCheckpoint(number))
+    return False

@@ -7,6 +7,7 @@ from math import inf
 
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.outcomes import Rejected
+from rosrm.core.master.state.backoff import Backoff
 
 
 @dataclass(slots=True)
@@ -25,6 +26,8 @@ class Dumped:
         order: order of a dump without an answer yet; None: there is none.
         asked: incarnation of the slave that received the order.
         trouble: why the last dump failed; "": it did not.
+        backoff: of failed dumps, then of the order to remove all images.
+        removal: the newest order to remove all images; None: the instance has not ended.
     """
 
     process: str
@@ -38,6 +41,8 @@ class Dumped:
     order: OrderId | None = None
     asked: int = 0
     trouble: str = ""
+    backoff: Backoff = field(default_factory=Backoff)
+    removal: OrderId | None = None
 
 
 @dataclass(slots=True)
