@@ -84,7 +84,9 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
         _review_delivery(state, instance, age, now)
     if waits_too_long(state, instance, now):
         _cancel_prefetch(state, instance, now)
-    if instance.stopping and now - instance.order_at >= state.settings.order_retry:
+    # A host that is away gets the order when it registers, or at the first tick after its return.
+    is_due = instance.stopping and now - instance.order_at >= state.settings.order_retry
+    if is_due and not state.hosts.why_unreachable(instance.host):
         stop_instance(state, instance, now)
     restarts.review(state, instance, now)
     review_reservation(state, instance, now)
