@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final, NoReturn, TextIO
 
-from rosrm.cli.process import INTERRUPTED
+from rosrm.cli.process import INTERRUPTED, NO_ROOM
 
 #: New objects after which Python looks for cycles: more than the imports of a command create, for
 #: which the default of 700 costs 10 % of a command's CPU time.
@@ -70,7 +70,7 @@ def _run(arguments: Sequence[str]) -> None:
         _leave(ended.code)
         raise
     except OSError as error:
-        if error.errno != errno.ENOSPC:
+        if error.errno not in NO_ROOM:
             raise
         early.drop()
         _say(f"rosrm: {error}")

@@ -18,6 +18,7 @@ from typing import Any, Final
 import typer
 
 from rosrm.cli.groups import CommandLineError, PlainCommand, add_command
+from rosrm.cli.process import NO_ROOM
 from rosrm.errors import PluginError, RosrmError, describe_plugin_fault
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.installed import COMMANDS, PluginAddress, installed_plugins
@@ -28,7 +29,7 @@ from rosrm.wording import listed
 #: Seconds for the import of a command; nothing but the command waits for it.
 _LOADING: Final = 60.0
 #: Errors of writing the output, which the entry point of the command reports.
-_OF_OUTPUT: Final = (errno.EPIPE, errno.ENOSPC)
+_OF_OUTPUT: Final = (errno.EPIPE, *NO_ROOM)
 
 
 def find_commands() -> dict[str, list[PluginAddress]]:

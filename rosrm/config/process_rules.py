@@ -40,6 +40,8 @@ from rosrm.wording import listed
 _TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 #: A name in a rule of ROS, which may have the name of a node and wildcards.
 _REMAPPED: Final = re.compile(r"[^\s:=\0]+(:[^\s:=\0]+)*")
+#: Bytes of a variable, with its name, that the kernel refuses for a new program.
+_LONGEST_TEXT: Final = 1 << 17
 _LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
 _ROS_ONLY: Final = ("node_name", "namespace", "parameters", "remappings")
 
@@ -295,6 +297,9 @@ def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
     for name, value in spec.environment.items():
         if not is_variable(name, value):
             yield Complaint(("environment", name), f"environment: {name!r} cannot be a variable")
+        elif len(f"{name}={value}".encode(errors="replace")) >= _LONGEST_TEXT:
+            size = f"at most {_LONGEST_TEXT >> 10} KiB are allowed; pass a long text in a file"
+            yield Complaint(("environment", name), f"environment.{name}: too long: {size}")
         elif fault := variable_fault(value):
             yield Complaint(("environment", name), f"environment.{name}: {fault}")
         elif spec.container.image and has_variable(value):

@@ -486,7 +486,9 @@ class SlaveRuntime:
             limits={name: float(self._limit[slot]) for slot, name in listed},
             instances=self._state.statuses(),
         )  # fmt: skip
-        self._textfile.write(metrics, now)
+        self._textfile.is_being_written = True  # until its disk has answered, also to a late one
+        written = partial(self._textfile.write, metrics, now)
+        self._paths.run(written, _ignore, _ignore)
 
     def _note_probes(self, reports: Sequence[ProbeReport]) -> None:
         """Log which readings became stale or fresh again, and report that to the master."""
@@ -695,6 +697,10 @@ class SlaveRuntime:
             done(outcome._replace(message=message))
 
         self._executors.execute(order.executor, arguments, order.timeout, here=here, done=answer)
+
+
+def _ignore(_outcome: object) -> None:
+    """Take an outcome that nobody waits for."""
 
 
 def _random_number() -> int:

@@ -17,6 +17,7 @@ from typing import Final
 
 from rosrm.model.values import InstanceState, InstanceStatus
 from rosrm.runtime import atomic_file
+from rosrm.runtime.path_calls import NoAnswer, at
 
 #: Seconds between two versions of the file.
 PERIOD: Final = 15.0
@@ -46,7 +47,10 @@ class HostMetrics:
 
 
 class Textfile:
-    """The file of a host, written every `PERIOD`.
+    """The file of a host, written every `PERIOD` in a thread, because its disk may not answer.
+
+    Attributes:
+        is_being_written: set by the caller of `write`, until its end.
 
     Args:
         directory: of the collector; `Path()`: no file is written.
@@ -58,10 +62,11 @@ class Textfile:
         self._path = directory / f"rosrm_slave_{host}.prom" if directory != Path() else None
         self._due = float("-inf")
         self._fault = ""
+        self.is_being_written = False
 
     def is_due(self, now: float) -> bool:
         """Return True if the file must be written at a monotonic time (s)."""
-        return self._path is not None and now >= self._due
+        return self._path is not None and now >= self._due and not self.is_being_written
 
     def write(self, metrics: HostMetrics, now: float) -> None:
         """Replace the file; log the beginning and the end of a failure."""
@@ -69,9 +74,12 @@ class Textfile:
         fault, path = "", self._path
         assert path is not None
         try:
+            at(path)
             os.close(atomic_file.replace(str(path), text_of(metrics, self._host), mode=_READABLE))
-        except OSError as error:
-            fault = error.strerror or str(error)
+        except (OSError, NoAnswer) as error:
+            fault = getattr(error, "strerror", None) or str(error)
+        finally:
+            self.is_being_written = False
         if fault and not self._fault:
             _log.warning("textfile: %s cannot be written: %s; the slave tries again", path, fault)
         elif self._fault and not fault:
@@ -80,7 +88,7 @@ class Textfile:
 
     def remove(self) -> None:
         """Remove the file, because its values are no longer current."""
-        if self._path is not None:
+        if self._path is not None and not self.is_being_written:
             with suppress(OSError):
                 self._path.unlink()
 

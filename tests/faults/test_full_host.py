@@ -57,4 +57,6 @@ def test_a_slave_starts_again_on_a_full_disk(cluster, disk) -> None:
     disk.fill()
     cluster.start_slave_again("h0")
     assert cluster.wait("runs", "running").pid == pid
+    cluster.wait_for_event("plugin_failed", "written to the state directory: No space left")
     disk.make_room()
+    cluster.wait_for_event("plugin_works", "state directory")

@@ -82,6 +82,8 @@ def _program(facts: ProcessFacts) -> tuple[dict[str, Any], Sequence[str]]:
     """Return the keys that name the program, and the words after it."""
     first, *words = facts.words or (facts.program,)
     path = _absolute(first, facts)
+    if facts.words[-1:] == ("",) and not _names_program(first, facts):
+        words = []  # the process has set a title, which leaves NUL bytes in place of its arguments
     if not (_PYTHON.fullmatch(path.name) and words and not words[0].startswith("-")):
         return _package_of(path, facts) or {"command": [str(path)]}, words
     script = Path(facts.directory, words.pop(0))
@@ -102,6 +104,13 @@ def _absolute(word: str, facts: ProcessFacts) -> Path:
     except SpawnError:
         return Path(facts.program)
     return path if os.access(path, os.X_OK) else Path(facts.program)
+
+
+def _names_program(word: str, facts: ProcessFacts) -> bool:
+    try:
+        return Path(facts.directory, on_path(word, facts.environment)).is_file()
+    except SpawnError:
+        return False
 
 
 def _package_of(path: Path, facts: ProcessFacts) -> dict[str, Any]:

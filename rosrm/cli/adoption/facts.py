@@ -6,10 +6,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from rosrm.errors import Refused
 from rosrm.model.adoption import LARGEST_PID
 from rosrm.supervisor import adoption, procfs
+
+#: End of the path of a file that was removed, in a link of /proc.
+_DELETED: Final = " (deleted)"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,7 @@ def read_facts(pid: int) -> ProcessFacts:
         environment, has_ros = environment_of(pid), _has_ros(pid)
     except OSError as error:
         raise Refused(f"process {pid} cannot be read: {error.strerror}") from None
+    program, directory = program.removesuffix(_DELETED), directory.removesuffix(_DELETED)
     return ProcessFacts(pid, stat.start, words, program, directory, environment, has_ros)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +18,7 @@ from rosrm.config.work import processes_of
 from rosrm.errors import Refused
 from rosrm.model.values import KEEP_NAME, ParameterSource
 from rosrm.supervisor.adoption import is_own
+from tests.waiting import command_of, wait_until
 
 PACKAGES = "share/ament_index/resource_index/packages"
 
@@ -105,6 +107,26 @@ def test_a_program_that_is_not_found_by_its_word_is_the_file_that_runs() -> None
     """A program may set its own command line, or have none."""
     assert keys_of(facts("my robot: idle"))["command"] == ["/usr/bin/program"]
     assert keys_of(facts())["command"] == ["/usr/bin/program"]
+
+
+def test_a_set_title_hides_the_arguments() -> None:
+    """It leaves empty words; a program with an empty last argument keeps its words."""
+    keys = keys_of(facts("my robot: idle", "", ""))
+    assert (keys["command"], keys.get("arguments")) == (["/usr/bin/program"], None)
+    assert keys_of(facts("/bin/echo", "x", ""))["arguments"] == ["x", ""]
+
+
+def test_a_removed_executable_has_its_former_path(tmp_path) -> None:
+    """The kernel marks such a path, which then names no file."""
+    program = tmp_path / "sleep"
+    shutil.copy("/bin/sleep", program)
+    with subprocess.Popen([program, "1000"], cwd=tmp_path) as process:
+        try:
+            wait_until(lambda: command_of(process.pid).startswith(str(program)), "its exec")
+            program.unlink()
+            assert read_facts(process.pid).program == str(program)
+        finally:
+            process.kill()
 
 
 def test_a_node_without_ros_arguments_keeps_its_names() -> None:

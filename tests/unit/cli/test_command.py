@@ -131,8 +131,8 @@ def test_ctrl_c_in_a_running_command_is_clean(tmp_path):
 
 @pytest.mark.parametrize("ros", [False, True])
 @pytest.mark.parametrize("command", ["show", "write"])
-@pytest.mark.parametrize("output", ["closed pipe", "full disk", "closed"])
-def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
+@pytest.mark.parametrize("output", ["closed pipe", "full disk", "closed", "file limit"])
+def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros, tmp_path):
     """Exit with 1, in silence for a closed pipe; `write` leaves its output to the exit."""
     code = (
         "import sys, types\n"
@@ -150,6 +150,8 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
     words = [sys.executable, "-c", code]
     if output == "closed":
         words = ["sh", "-c", 'exec "$0" "$@" >&-', *words]
+    if output == "file limit":
+        words = ["sh", "-c", f'ulimit -f 0; exec "$0" "$@" >{tmp_path}/output', *words]
     read, write = os.pipe()
     os.close(read)
     with os.fdopen(write, "wb") as pipe, Path("/dev/full").open("wb") as full:
@@ -159,8 +161,9 @@ def test_output_that_cannot_be_written_gives_no_traceback(command, output, ros):
         )  # fmt: skip
     lines = done.stderr.splitlines()
     assert done.returncode == (0 if output == "closed" else 1), lines
-    assert len(lines) == (1 if output == "full disk" else 0), lines
-    assert all("No space left on device" in line for line in lines)
+    assert len(lines) == (output in ("full disk", "file limit")), lines
+    said = "File too large" if output == "file limit" else "No space left on device"
+    assert all(said in line for line in lines)
 
 
 ASKING = """

@@ -532,6 +532,10 @@ def test_duplicate_names_are_refused_naming_both_places(refusal):
         ("name: a, module: x, ros: true, parameters: {b: [9223372036854775808]}", "of 64 bits is"),
         ("name: a, command: x, working_directory: ''", "f.yaml:1:54: working_directory: "),
         ("name: a, command: x, environment: {A=B: c}", "'A=B' cannot be a variable"),
+        (
+            f"name: a, command: x, environment: {{A: {'x' * (1 << 17)}}}",
+            "environment.A: too long: at most 128 KiB",
+        ),
         ("name: a, command: x, restart: sometimes", 'restart.when: "sometimes" is unknown'),
         ("name: a, command: x, restart: {when: always, delay: 1h}", "max_delay must not be less"),
         ("name: a, command: x, kind: jobs", """kind: "jobs" is unknown; did you mean 'job'?"""),
