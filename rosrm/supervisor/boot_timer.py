@@ -6,7 +6,6 @@ time would be seen too late by the whole rest of the wait. This timer fires at t
 
 from __future__ import annotations
 
-import ctypes
 import os
 import time
 from typing import Final
@@ -16,13 +15,6 @@ from rosrm.supervisor import own_log
 _ABSOLUTE: Final = 1
 #: Seconds; a later deadline is never reached, and might not fit in the kernel's structure.
 _LATEST: Final = 2.0**32
-_libc = ctypes.CDLL(None, use_errno=True)
-
-
-class _Times(ctypes.Structure):
-    """`struct itimerspec`: period, which stays 0, and time of expiry."""
-
-    _fields_ = [(name, ctypes.c_long) for name in ("_s", "_ns", "seconds", "nanoseconds")]
 
 
 class BootTimer:
@@ -33,14 +25,25 @@ class BootTimer:
     """
 
     def __init__(self) -> None:
-        flags = os.O_CLOEXEC | os.O_NONBLOCK
-        self.descriptor = int(_libc.timerfd_create(time.CLOCK_BOOTTIME, flags))
+        self.descriptor = -1
         self._deadline: float | None = None
-        if self.descriptor < 0:
+        try:
+            self._open()
+        except (ImportError, OSError) as fault:
             own_log.write(
-                f"no timer of the boot clock: {os.strerror(ctypes.get_errno())}; after a suspend "
-                "of this machine, fences may be late"
+                f"no timer of the boot clock: {fault}; after a suspend of this machine, fences may "
+                "be late"
             )
+
+    def _open(self) -> None:
+        import ctypes  # noqa: PLC0415 - 1 MiB, which a supervisor without deadlines does not need
+
+        libc = ctypes.CDLL(None, use_errno=True)
+        flags = os.O_CLOEXEC | os.O_NONBLOCK
+        self.descriptor = int(libc.timerfd_create(time.CLOCK_BOOTTIME, flags))
+        if self.descriptor < 0:
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        self._set_time, self._times = libc.timerfd_settime, ctypes.c_long * 4
 
     def set(self, deadline: float | None) -> None:
         """Set the deadline, by the boot clock; None: there is none."""
@@ -49,8 +52,8 @@ class BootTimer:
         self._deadline = deadline
         # 0 would switch the timer off, also for a deadline that is long past.
         nanoseconds = 0 if deadline is None else max(1, int(min(deadline, _LATEST) * 1e9))
-        times = _Times(0, 0, *divmod(nanoseconds, 10**9))
-        _libc.timerfd_settime(self.descriptor, _ABSOLUTE, ctypes.byref(times), None)
+        times = self._times(0, 0, *divmod(nanoseconds, 10**9))  # `struct itimerspec`, no period
+        self._set_time(self.descriptor, _ABSOLUTE, times, None)
 
     def clear(self) -> None:
         """Take note that the deadline has passed."""

@@ -97,7 +97,7 @@ class Server:
         self._listener = listener
         self._files = files
         self._selector = selectors.DefaultSelector()
-        self._timer = BootTimer()
+        self._timer: BootTimer | None = None
         self._core = SupervisorState()
         self._confinement = Confinement(state)
         self._groups = self._confinement.groups
@@ -128,8 +128,6 @@ class Server:
         Ended instances stay in the record; the next client to connect starts another supervisor.
         """
         self._watch(self._listener, self._accept)
-        if self._timer.descriptor >= 0:
-            self._watch(self._timer.descriptor, self._timer.clear)
         self._watch_signals()
         _guarded(self._take_over)
         while True:
@@ -184,8 +182,17 @@ class Server:
         starts = self._starts.values()
         deadlines += [start.due if self._is_late(start) else start.late for start in starts]
         due = [deadline for deadline in deadlines if deadline is not None]
-        self._timer.set(min(due, default=None))
+        self._set_timer(deadlines[0])
         return min(max(0.0, min(due) - clocks.boot_time()), LONGEST_WAIT) if due else None
+
+    def _set_timer(self, deadline: float | None) -> None:
+        """Have the loop wake at a deadline of the core, also in a suspend of this machine."""
+        if self._timer is None and deadline is not None:
+            self._timer = BootTimer()
+            if self._timer.descriptor >= 0:
+                self._watch(self._timer.descriptor, self._timer.clear)
+        if self._timer is not None:
+            self._timer.set(deadline)
 
     def _leave(self) -> None:
         self._groups.close()

@@ -115,6 +115,7 @@ class MasterState:
             of submission, because a replay must begin them in the same order.
         held_since: time since when placement waits for first requests for work; inf: no wait.
         contact_since: time since when at least one host reports; inf: none does.
+        restored_at: time at which this master read its journal; -inf: it has read none.
         next_loss: time at which the next host is lost, unless it reports before; inf: none is.
         strays: process name to the numbers of the instances that a host reports although the master
             has not assigned them to it. They are stopped, and give the host no right.
@@ -184,6 +185,7 @@ class MasterState:
         self.periodic = Periodic()
         self.next_order = self.next_instance = self.reserved_instances = 1
         self.wall = 0.0
+        self.restored_at = -inf
         self.contact_since = self.next_loss = inf
         self.held_since = inf
         self.journal_gap = JournalGap()

@@ -222,6 +222,25 @@ def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
     assert states(cluster) == {"exploring": "", "docked": "in force"}
 
 
+def test_a_clock_that_is_set_ends_no_switch() -> None:
+    """A restarted master counts the wait of a process by its own time, not by unix time."""
+    waiting = target("nav", process("planner", 8_000, host_loss=HostLossPolicy("elsewhere")))
+    large = target("map", process("mapper", 8_000))
+    cluster = in_mode(
+        "exploring", Mode("exploring", (waiting, large)), Mode("docked", (waiting,)),
+        cluster=Cluster("a", "b", progress_deadline=20.0),
+    )  # fmt: skip
+    cluster.cut(*cluster.where("planner"))
+    cluster.wait(60.0)
+    (host,) = cluster.where("mapper")
+    cluster.machines[host].stubborn.add("mapper")
+    assert switch(cluster, "docked").accepted
+    cluster.clock_set_by = 2e9
+    cluster.restart_master()
+    cluster.wait(3.0)
+    assert not cluster.recorded("mode_failed")
+
+
 def test_a_new_version_that_fails_ends_the_switch() -> None:
     """The application returns to its former version, and the cluster to its former mode."""
     worse = target("nav", new(movable("planner")), process("driver"), healthy_for=3.0)

@@ -60,7 +60,7 @@ def is_set_aside_for_good(
     if application.former:
         return task.replaces
     settings = state.settings
-    return bool(settings.progress_deadline) and now - process.since >= settings.lease
+    return bool(settings.progress_deadline) and _waited(state, process, now) >= settings.lease
 
 
 def has_waited_too_long(state: MasterState, process: Process, since: float, now: float) -> bool:
@@ -68,4 +68,12 @@ def has_waited_too_long(state: MasterState, process: Process, since: float, now:
     deadline = state.settings.progress_deadline
     if not deadline or process.spec.kind is Kind.JOB or not awaits_host(state, process):
         return False
-    return now - max(process.since, since) >= deadline
+    return min(now - since, _waited(state, process, now)) >= deadline
+
+
+def _waited(state: MasterState, process: Process, now: float) -> float:
+    """Return the seconds of a wait that this master has seen.
+
+    The time before comes from the journal as unix time, and the clock may have been set since.
+    """
+    return now - max(process.since, state.restored_at)

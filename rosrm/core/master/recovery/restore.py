@@ -48,6 +48,7 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
 
     `intents` returns a table of the journal by its name; `state.wall` must be set.
     """
+    state.restored_at = now
     by_id = sorted(intents("host").items(), key=lambda item: int(item[1]["host_id"]))
     for name, host in by_id:
         state.hosts.expect(
