@@ -92,7 +92,7 @@ def up(  # noqa: PLR0917 - an argument for each option
     settings = _settings(file, registry)
     ros = with_domain(_local(settings.ros, discovery), ctx, domain)
     work = [checked_work(read(name), name, registry) for name in files or []]
-    directory = (state or Path(tempfile.mkdtemp(prefix="rosrm-up-"))).absolute()
+    directory = (state or _temporary_directory()).absolute()
     with cleaned(directory, keep=state is not None):
         cluster = UpCluster(
             directory, replace(settings, ros=ros),
@@ -101,6 +101,16 @@ def up(  # noqa: PLR0917 - an argument for each option
             joining=ros, ends_with_starter=True,
         )  # fmt: skip
         session.serve(cluster, work)
+
+
+def _temporary_directory() -> Path:
+    from rosrm.errors import ConfigError
+
+    try:
+        return Path(tempfile.mkdtemp(prefix="rosrm-up-"))
+    except OSError as error:
+        text = f"no temporary directory for the state: {error.strerror}; give one by --state DIR"
+        raise ConfigError(text) from None
 
 
 def _settings(file: Path | None, registry: Registry) -> ClusterConfig:

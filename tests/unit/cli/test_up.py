@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tempfile
 from types import SimpleNamespace
 
 import pytest
@@ -117,3 +118,10 @@ def test_after_a_fault_the_first_signal_already_hurries():
         with pytest.raises(session._Hurried):
             signals._handle(2, None)
         signals._handle(2, None)  # a third one is ignored
+
+
+def test_a_missing_temporary_directory_is_said(monkeypatch, tmp_path):
+    """The disk may be full or read-only; the message names the option that helps."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(ConfigError, match=r"no temporary directory for the state: .*--state DIR"):
+        up._temporary_directory()
