@@ -160,7 +160,8 @@ def test_every_process_is_written_back_as_it_was_read(state: MasterState, name: 
     if before["standby"]:
         before["standby"] = with_new_fields({"source_devices": [], **before["standby"]})
     if before["left_behind"]:
-        before["left_behind"] = [*before["left_behind"], 0.0]  # the start of the process
+        known = zip(("number", "host", "node_name"), before["left_behind"], strict=True)
+        before["left_behind"] = {**again["left_behind"], **dict(known)}  # a list in older journals
     changed = {field: (before[field], value) for field, value in again.items()
                if before[field] != value}  # fmt: skip
     if process.phase not in WAITING:
