@@ -53,10 +53,10 @@ def test_a_later_deadline_replaces_an_earlier_one(timer, none) -> None:
     timer.clear()  # wakes nobody, and does not wait
 
 
-def test_a_machine_without_such_timers_is_no_fault(monkeypatch, capsys) -> None:
+def test_a_machine_without_such_timers_is_no_fault(monkeypatch, capfd) -> None:
     """A filter of system calls may refuse them; the selector then waits by its own time-out."""
     monkeypatch.setitem(sys.modules, "ctypes", None)
     timer = BootTimer()
     timer.set(0.0)
     assert timer.descriptor == -1
-    assert "after a suspend of this machine, fences may be late" in capsys.readouterr().err
+    assert "after a suspend of this machine, fences may be late" in capfd.readouterr().err

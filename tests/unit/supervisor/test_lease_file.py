@@ -32,10 +32,10 @@ def test_an_unreadable_lease_file_does_not_count(tmp_path, content):
     assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
 
 
-def test_a_lease_file_that_cannot_be_written_is_logged_once(tmp_path, capsys):
+def test_a_lease_file_that_cannot_be_written_is_logged_once(tmp_path, capfd):
     """Fences then rely on the contacts known to this supervisor."""
     (tmp_path / "heard").mkdir()
     kept = lease_file.LastContact(str(tmp_path))
     kept.keep(ContactReported(5.0))
     kept.keep(ContactReported(6.0))
-    assert capsys.readouterr().err.count("heard cannot be written: Is a directory") == 1
+    assert capfd.readouterr().err.count("heard cannot be written: Is a directory") == 1
