@@ -23,11 +23,13 @@ from rosrm.core.supervisor.rules import (
     RunLimits,
     StopRule,
 )
+from rosrm.model.durations import LONGEST_STOP
 from rosrm.supervisor import json_lines as ls
 from rosrm.supervisor import messages
 from rosrm.supervisor.logs import LogLimits
 
 SECONDS = st.floats(0, 1e6)
+GRACE = st.floats(0, LONGEST_STOP / 2)
 WHOLE = st.integers(-(2**63), 2**63)
 KEYS = st.tuples(st.text(), st.integers(0, 2**53))
 # Arguments as Linux passes them: any bytes; invalid UTF-8 becomes surrogates.
@@ -64,7 +66,7 @@ ORDERS = st.one_of(
         CHANGES,
         st.none() | WORDS,
         RULES,
-        st.builds(StopRule, SECONDS, SECONDS),
+        st.builds(StopRule, GRACE, GRACE),
         st.text(),
         st.none() | st.builds(FenceRule, SECONDS, SECONDS, st.booleans()),
         SECONDS,
