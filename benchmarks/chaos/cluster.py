@@ -41,6 +41,8 @@ _MEMORY: Final = 2 * GIB
 _DISK: Final = 96 * MIB
 #: Seconds after which the service manager restarts a part that has ended unexpectedly.
 _AGAIN: Final = 1.0
+#: Most runs of the master whose records are kept.
+_MOST_RECORDS: Final = 1000
 #: Seconds for parts to shut down.
 _END: Final = 30.0
 #: Part of a supervisor's command line.
@@ -87,9 +89,10 @@ class Cluster:
         plans = uniform(len(HOSTS), memory=_MEMORY, disk=_DISK)
         self.lab: Final = Lab(name, [*plans, HostPlan(DESK, disk=_DISK)])
         self.folder: Final = folder
+        self.records: Final = folder / "records"
         self._tell = tell
         self._opened = ExitStack()
-        self.parts: Final = {MASTER: self._part(MASTER, DESK, _master_settings())}
+        self.parts: Final = {MASTER: self._part(MASTER, DESK, _master_settings(self.records))}
         for host in HOSTS:
             self.parts[host] = self._part("slave", host, _slave_settings(host))
 
@@ -210,10 +213,11 @@ class Cluster:
         return Part(name, host, command, self.folder / f"{name}-{host}.log")
 
 
-def _master_settings() -> dict[str, object]:
+def _master_settings(records: Path) -> dict[str, object]:
     return {
         "name": "chaos",
         "state": "/run/data/master",
+        "record": {"directory": str(records), "keep": _MOST_RECORDS},
         "liveness": {"suspect": 1.0, "lease": LEASE_S},
         # A migration is requested by the benchmark or is a fault: the master starts none.
         "migration": {"strategies": {"relaunch": {}, "handoff": {}}, "automatic": False},

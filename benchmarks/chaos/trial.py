@@ -6,7 +6,7 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -23,6 +23,8 @@ from benchmarks.chaos.rollout import Rollout
 from benchmarks.chaos.rules import Violation
 from benchmarks.chaos.stalls import StallWatch, before_fences, confirmed, read_fences
 from benchmarks.machine import say
+from rosrm.extensions.registry import Registry
+from rosrm_simulate.runs import checked, load_record, replay_record
 
 #: Seconds after the last fault was undone within which all must be well.
 SETTLE_S: Final = 60.0
@@ -135,7 +137,7 @@ class Trial:
         self._oracle.counts = self._tally.counts
 
     def end(self) -> None:
-        """Cancel everything, stop the slaves, and check for orphans."""
+        """Cancel everything, stop the slaves, and check for orphans and broken invariants."""
         names = list(self._accepted.services)
         self._accepted.services.clear()
         self._oracle.counts = []
@@ -144,6 +146,8 @@ class Trial:
         self._cluster.shut_down()
         if left := self._oracle.left():
             self._violated(0, [Violation(one.kind, one.name, one.text) for one in left])
+        if broken := list(_broken_invariants(self._cluster.records)):
+            self._violated(0, broken)
 
     # --- a round ------------------------------------------------------------------------------
 
@@ -402,6 +406,16 @@ class Trial:
             self._tend()
             time.sleep(_LOOK)
         return answers[0].answer if answers else {"no_master": "no answer in 20 s"}
+
+
+def _broken_invariants(records: Path) -> Iterator[Violation]:
+    """Replay each run of the master, and yield the first invariant that did not hold in it."""
+    registry = Registry.discover()
+    for path in sorted(records.iterdir()):
+        try:
+            replay_record(load_record(path, cut=True), registry, watcher=checked)
+        except AssertionError as fault:
+            yield Violation("state", "", f"{path.name}: {fault}")
 
 
 def guarantees_of(service: work.Service) -> Guarantees:

@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.invariants import check
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -33,7 +34,6 @@ from rosrm.model.values import (
     ResourceDescription,
 )
 from tests.fuzz.hostile import floats, fuzzed, texts, uint64s, values_of
-from tests.unit.core import invariants
 from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
 
 NAMES = ["job", "service", "node", "moves", "queued"]
@@ -179,8 +179,7 @@ class Besieged(Cluster):
                 self.wait(0.5)
             else:
                 self.tell(event)
-            invariants.no_process_is_lost(self.state)
-            invariants.the_books_balance(self.state)
+            check(self.state)
             for name in self.state.processes:
                 self.explain(name)
 
@@ -192,8 +191,7 @@ def test_hostile_events_leave_a_sound_state(stream):
     cluster = Besieged()
     cluster.suffer(stream)
     cluster.kill_master()
-    invariants.no_process_is_lost(cluster.state)
-    invariants.the_books_balance(cluster.state)
+    check(cluster.state)
 
 
 def weight_of(thing: Any, seen: set[int]) -> int:
@@ -245,7 +243,7 @@ def test_an_instance_gets_no_number_that_a_host_has_claimed():
         cluster.suffer([(0.0, event), (0.0, None)])
     for number in range(3):
         cluster.submit(process(f"more{number}"))
-        invariants.the_books_balance(cluster.state)
+        check(cluster.state)
 
 
 @pytest.mark.parametrize("after", [-1.0, -math.inf, math.nan])

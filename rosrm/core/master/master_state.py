@@ -589,7 +589,16 @@ class MasterState:
         self.add_instance(instance, spec, host, now, demand, need, devices=chosen)
 
     def reserve_rest(self, instance: Instance) -> None:
-        """Reserve the part of the demand of an instance that the readings do not show yet.
+        """Reserve the part of the demand of an instance that the readings do not show yet."""
+        reserved = self.rest_of(instance)
+        change = reserved.copy()
+        change[: len(instance.reserved)] -= instance.reserved
+        if np.any(change):
+            instance.reserved = reserved
+            self.hosts.add_reservation(instance.host, change)
+
+    def rest_of(self, instance: Instance) -> FloatArray:
+        """Return the part of the demand of an instance that is to be reserved, fractions.
 
         An estimate ends after `settle`. Usage that was measured before a move ends when the
         readings show the instance at its new host. The declared needs stay.
@@ -603,12 +612,7 @@ class MasterState:
             if amount > shown and resource not in ended:
                 left[resource] = amount - shown
         fractions = self.hosts.fractions_of(host, left, instance.estimated)
-        reserved = np.where(fractions < np.inf, fractions, 0.0)
-        change = reserved.copy()
-        change[: len(instance.reserved)] -= instance.reserved
-        if np.any(change):
-            instance.reserved = reserved
-            self.hosts.add_reservation(host, change)
+        return np.where(fractions < np.inf, fractions, 0.0)
 
     def note_held(self, instance: Instance, devices: tuple[HeldDevice, ...]) -> None:
         """Note the devices that an instance holds by the report of its slave.

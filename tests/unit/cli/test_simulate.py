@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from rosrm.cli.output import tables
+from rosrm.core.master import invariants
 from rosrm_simulate import picture
 from rosrm_simulate.runs import SimulationRequest, carry_out
 from tests.unit.tools.simulate.workloads import host, plan, recorded, simulation
@@ -172,6 +173,15 @@ def test_a_record_cut_short_is_used_up_to_the_cut(rosrm, tmp_path, content):
     (tmp_path / "r.rosrec").write_bytes(content[:-200])
     result = rosrm("simulate", tmp_path / "r.rosrec", "--cut")
     assert (result.code, "cut short" in result.out) == (0, True)
+
+
+@pytest.mark.parametrize("what", ["workload", "record"])
+def test_the_invariants_of_the_core_are_checked_on_request(rosrm, request, what, monkeypatch):
+    path = request.getfixturevalue(what)
+    assert rosrm("simulate", path, "--check").code == 0
+    monkeypatch.setattr(invariants, "INVARIANTS", (lambda _: iter(["p is nowhere"]),))
+    assert rosrm("simulate", path).code == 0
+    assert "p is nowhere" in rosrm("simulate", path, "--check").err
 
 
 @pytest.mark.parametrize(

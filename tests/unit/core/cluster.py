@@ -23,6 +23,7 @@ import rosrm_migration.plugin
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
 from rosrm.core.master.commands import Command, Reply, SendOrder
+from rosrm.core.master.invariants import check
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
@@ -206,6 +207,7 @@ class Cluster(World[Machine]):
 
     now = 100.0
     clock_set_by = 0.0
+    checks = 20
 
     def __init__(
         self, *machines: Machine | str, policy: Any = None, strategies: Mapping[str, Any] = EMPTY,
@@ -496,6 +498,7 @@ class Cluster(World[Machine]):
         self.air.master_is_gone()
         self.state = self._new_state(self.state.epoch + 1)
         restore(self.state, lambda table: self.intents[table], self.now)
+        check(self.state)
 
     # --- observations --------------------------------------------------------------------
 

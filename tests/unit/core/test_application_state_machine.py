@@ -16,11 +16,11 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.commands import Assign, Command
+from rosrm.core.master.invariants import check
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.applications import Action, RolloutPolicy, Target
 from rosrm.model.modes import Mode
 from rosrm.model.values import HostLossPolicy, Kind, MigrationPolicy, ProcessSpec, StartOrder
-from tests.unit.core import invariants
 from tests.unit.core.cluster import Cluster, Machine, process
 
 NAMES = {"nav": ["n0", "n1", "n2", "n3"], "map": ["m0", "m1", "m2"]}
@@ -224,11 +224,7 @@ class Applications(RuleBasedStateMachine):
 
     @invariant()
     def the_state_is_sound(self) -> None:
-        state = self.cluster.state
-        invariants.no_process_is_lost(state)
-        invariants.the_books_balance(state)
-        invariants.gangs_are_known(state)
-        invariants.known_places_are_current(state)
+        check(self.cluster.state)
 
     @invariant()
     def no_process_runs_twice(self) -> None:

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
 from rosrm.core.master import listing
+from rosrm.core.master.invariants import check
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.requester import Requester
 from rosrm.model.values import ProcessSpec, ReschedulePolicy
-from tests.unit.core import invariants
 from tests.unit.core.cluster import Cluster, Machine, job, process
 
 
@@ -86,7 +86,7 @@ def test_the_bound_survives_a_restart_of_the_master() -> None:
     cluster.restart_master()
     cluster.wait(2.0)
     assert running(cluster) == before
-    invariants.no_process_is_lost(cluster.state)
+    check(cluster.state)
 
 
 def test_a_job_that_is_set_aside_gives_up_its_place() -> None:
@@ -134,4 +134,4 @@ def test_the_bound_holds_whatever_happens(backfill: bool, data: st.DataObject) -
             cluster.restart_master()
         cluster.wait(0.3)
         assert len(running(cluster)) <= parallel
-        invariants.no_process_is_lost(cluster.state)
+        check(cluster.state)

@@ -11,8 +11,8 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
+from rosrm.core.master.invariants import check
 from rosrm.model.values import HostLossPolicy, NeighbourRule
-from tests.unit.core import invariants
 from tests.unit.core.cluster import MIB, Cluster, Machine, movable, process
 
 RACKS = {"a": "1", "b": "1", "c": "2", "d": "2"}
@@ -124,9 +124,7 @@ class Neighbours(RuleBasedStateMachine):
 
     @invariant()
     def state_is_sound(self) -> None:
-        invariants.no_process_is_lost(self.cluster.state)
-        invariants.the_books_balance(self.cluster.state)
-        invariants.known_places_are_current(self.cluster.state)
+        check(self.cluster.state)
 
     def live(self) -> list[str]:
         known = self.cluster.state.processes.values()

@@ -51,6 +51,12 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
         ),
     ] = None,
     cut: Annotated[bool, typer.Option("--cut", help="Accept a record that is cut short.")] = False,
+    check: Annotated[
+        bool,
+        typer.Option(
+            "--check", help="Check the invariants of the master's core after each step; slower."
+        ),
+    ] = False,
     plot: Annotated[
         Path | None,
         typer.Option("--plot", metavar="FILE", help="Draw the runs: .png, .svg or .pdf."),
@@ -69,7 +75,7 @@ def simulate(  # noqa: PLR0913, PLR0917 - an argument for each option
         picture.check(plot)
     request = SimulationRequest(
         file, variants, tuple(variant or ()), tuple(policy or ()), tuple(hosts or ()), until, seed,
-        cut,
+        cut, check,
     )  # fmt: skip
     report = carry_out(request)
     if plot is not None:

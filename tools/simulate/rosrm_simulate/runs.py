@@ -17,8 +17,9 @@ from rosrm.config.documents import Node
 from rosrm.config.placement import chain_of, placement_of
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master.commands import Command
+from rosrm.core.master.invariants import check
 from rosrm.core.master.master_state import MasterState
-from rosrm.errors import ConfigError, RecordError
+from rosrm.errors import ConfigError, RecordError, RosrmError
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import PlacementPlugins
@@ -46,6 +47,8 @@ from rosrm_simulate.workload_file import load_workload
 #: Seconds after which progress is shown.
 _SHOWN_AFTER: Final = 2.0
 _LONGEST_OPENING: Final = 64
+#: Of so many steps without a command, one is checked.
+_CHECKED: Final = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +63,7 @@ class SimulationRequest:
     until: str = ""
     seed: int | None = None
     cut: bool = False
+    check: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +100,17 @@ class SimulationReport:
 
 def carry_out(request: SimulationRequest) -> SimulationReport:
     """Simulate; raises `ConfigError` or `RecordError` for errors in the files."""
+    try:
+        return _carried_out(request)
+    except AssertionError as fault:
+        if not request.check:
+            raise
+        raise RosrmError(
+            f"{request.file}: an invariant of the core does not hold: {fault}"
+        ) from None
+
+
+def _carried_out(request: SimulationRequest) -> SimulationReport:
     registry = Registry.discover()
     changes = _changes(request)
     if _holds_record(request.file):
@@ -105,7 +120,9 @@ def carry_out(request: SimulationRequest) -> SimulationReport:
     comparison = load_workload(request.file, registry, changes, request.seed)
     workload = _ended(comparison.workload, _end(request))
     with _progress() as shown:
-        runs = [run(workload, one, registry, shown) for one in comparison.variants]
+        runs = [
+            run(workload, one, registry, shown, checks=request.check) for one in comparison.variants
+        ]
     return SimulationReport(workload, tuple(runs))
 
 
@@ -159,14 +176,15 @@ def _of_record(
     name = f"settings in {request.file}"
     base = settings_node(recording.header.config, name)
     variants = load_variants(base, changes, request.file, registry, title="simulated")
-    replayed, workload = replay_record(recording, registry, until)
+    watcher = checked if request.check else None
+    replayed, workload = replay_record(recording, registry, until, watcher)
     hosts = len(replayed.outcome.curves.hosts)
     runs = [SimulationRun("recorded", hosts, replayed.outcome)]
     workload = _ended(workload, until)
     if not workload.hosts:
         raise RecordError(f"{request.file}: no host ever registered in it: nothing to simulate")
     with _progress() as shown:
-        runs += [run(workload, one, registry, shown) for one in variants]
+        runs += [run(workload, one, registry, shown, checks=request.check) for one in variants]
     return SimulationReport(
         workload, tuple(runs), recording, replayed, compare(runs[0].outcome, runs[1].outcome)
     )
@@ -235,14 +253,28 @@ def replay_record(
 # --- runs -------------------------------------------------------------------------------------
 
 
+def checked(state: MasterState, one: Happened, commands: Sequence[Command]) -> None:
+    """Check the invariants of the core after an event that has commands."""
+    if commands:
+        try:
+            check(state)
+        except AssertionError as fault:
+            raise AssertionError(f"after {type(one.event).__name__}: {fault}") from None
+
+
 def run(
-    workload: Workload, variant: Variant, registry: Registry, shown: Shown | None = None
-) -> SimulationRun:
-    """Simulate one variant of a workload."""
+    workload: Workload, variant: Variant, registry: Registry, shown: Shown | None = None,
+    *, checks: bool = False,
+) -> SimulationRun:  # fmt: skip
+    """Simulate one variant of a workload.
+
+    `checks`: the invariants of the core are checked.
+    """
     if variant.hosts is not None:
         workload = workload.with_hosts(variant.hosts)
     placement, strategies, declared = _plugins(variant.cluster, registry)
     simulation = Simulation(workload, variant.cluster.core(), placement, strategies, declared)
+    simulation.checks = _CHECKED if checks else 0
     began = clocks.awake_time()
     outcome = simulation.run(None if shown is None else shown.named(variant.name))
     return SimulationRun(variant.name, len(workload.hosts), outcome, clocks.awake_time() - began)

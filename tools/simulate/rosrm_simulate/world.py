@@ -23,6 +23,7 @@ from rosrm.core.master.commands import (
     Withdraw,
 )
 from rosrm.core.master.events import AssignmentWithdrawn, Event, HostRegistered, ReadingsReceived
+from rosrm.core.master.invariants import check
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.reducer import step
 from rosrm.core.slave.events import ContactConfirmed, Registered
@@ -38,15 +39,18 @@ class World(ABC, Generic[HostT]):
         machines: by name.
         replies: replies of the master, by request number.
         publish: publishes the phase of a handoff to the nodes.
+        checks: the invariants of the core are checked after each step with commands, and after each
+            of so many others; 0: never.
     """
 
     publish: Callable[[PublishStateConfig], None]
+    checks: int = 0
 
     def __init__(self, state: MasterState) -> None:
         self.state = state
         self.machines: dict[str, HostT] = {}
         self.replies: dict[int, Reply] = {}
-        self._requests = 0
+        self._requests = self._steps = 0
 
     # --- differences between the simulator and the unit tests ------------------------------
 
@@ -81,7 +85,11 @@ class World(ABC, Generic[HostT]):
     def decide(self, event: Event) -> list[Command]:
         """Process an event in the master's core, and return its commands."""
         self.state.wall = self.wall
-        return step(self.state, event, self.now)
+        commands = step(self.state, event, self.now)
+        self._steps += 1
+        if self.checks and (commands or self._steps % self.checks == 0):
+            check(self.state)
+        return commands
 
     def tell(self, event: Event) -> list[Command]:
         """Process an event in the master's core, and carry out its commands."""

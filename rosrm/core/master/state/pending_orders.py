@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf
 from typing import Final, Literal
@@ -142,6 +143,9 @@ class PendingOrders:
             self.pending[order] = _Pending(purpose, seconds)
             self._unstamped.append(order)
         return order
+
+    def __iter__(self) -> Iterator[tuple[OrderId, Purpose]]:
+        return iter(self._purposes.items())
 
     def pop(self, order: OrderId) -> Purpose | None:
         """Remove an answered order and return its purpose; None: the order has none."""
