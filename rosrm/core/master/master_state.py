@@ -314,9 +314,21 @@ class MasterState:
         if process.phase is not phase:
             before = process.phase
             self._begin_phase(process, phase, now)
+            if process.next_spec is not None and process.is_at_rest:
+                self._drop_next_spec(process)
             self.start_orders.note_change(process.name)
             if process.awaits_gang or phase.is_terminal != before.is_terminal:
                 self._update_terminal(process)
+
+    def _drop_next_spec(self, process: Process) -> None:
+        """End the replacement of a process that has ended otherwise than for its next start.
+
+        The work that it has done is that of its former version. A cancelled one has done none, and
+        has the new version if it is started again.
+        """
+        spec, process.next_spec = process.next_spec, None
+        if spec is not None and process.phase is ProcessPhase.CANCELLED:
+            self.set_spec(process, spec)
 
     def _after_run(
         self, process: Process, end: ProcessPhase, reason: str

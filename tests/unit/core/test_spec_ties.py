@@ -262,3 +262,19 @@ def test_a_version_that_fails_during_a_return_leads_to_the_version_that_returns(
     assert row(cluster).state == "returning"
     cluster.apply("nav", spec, process("r"))
     assert cluster.state.applications["nav"].former == 1
+
+
+def test_a_process_that_is_cancelled_while_it_is_replaced_starts_again_with_its_new_version() -> (
+    None
+):
+    """Nothing is left of the replacement."""
+    cluster = Cluster(Machine("a", stubborn={"p"}))
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    cluster.apply("nav", new(process("p")))
+    cluster.cancel("p")
+    cluster.let_go("p")
+    assert (cluster.phase("p"), cluster["p"].next_spec) == ("cancelled", None)
+    assert cluster.restart("p").accepted
+    cluster.wait(1.0)
+    assert program(cluster, "p") == ("new",)
