@@ -184,6 +184,7 @@ class Play(RuleBasedStateMachine):
                 "lifecycle_node": LifecycleNode(LifecycleNodeOptions()),
             },
         )  # fmt: skip
+        self.cluster.checks = 0  # the state is checked after each rule
         self.cluster.state.replication.policy = OneOther()
         for name in HOSTS:
             labels = {"arm": "yes"} if name == LABELLED else {}
