@@ -145,7 +145,7 @@ class PendingOrders:
         return order
 
     def __iter__(self) -> Iterator[tuple[OrderId, Purpose]]:
-        return iter(self._purposes.items())
+        return ((order, one.purpose) for order, one in self.pending.items())
 
     def pop(self, order: OrderId) -> Purpose | None:
         """Remove an answered order and return its purpose; None: the order has none."""
