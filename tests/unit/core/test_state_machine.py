@@ -1090,8 +1090,7 @@ class Play(RuleBasedStateMachine):
                 for instance in list(machine.programs):
                     machine.tell(events.SeenInGraph(instance), self.cluster.now)
             self.cluster.wait(1.0, tick=0.5)
-            self.no_process_is_lost()
-            self.the_books_balance()
+            self.the_state_is_sound()
             self.never_two_active()
             self.the_newest_state_of_a_life_is_not_dropped()
 

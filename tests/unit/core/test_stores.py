@@ -6,10 +6,10 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Reply
+from rosrm.core.master.invariants import check
 from rosrm.model.ledger import BOUNDS, Amount, Store
 from rosrm.model.requester import Requester
 from rosrm.model.values import ProcessSpec
-from tests.unit.core import invariants
 from tests.unit.core.cluster import Cluster, job, process
 
 ALICE, MALLORY = Requester("user:alice"), Requester("user:mallory")
@@ -55,7 +55,7 @@ def test_ended_processes_give_way_to_new_ones_of_their_user() -> None:
     own = [name for name in cluster.state.processes if name.startswith("m")]
     assert own == [f"m{number}" for number in range(31, 40)]
     assert "alice" in cluster.state.processes
-    invariants.the_books_balance(cluster.state)
+    check(cluster.state)
 
 
 def test_versions_of_applications_are_bounded_by_owner() -> None:
@@ -70,7 +70,7 @@ def test_versions_of_applications_are_bounded_by_owner() -> None:
     assert len(cluster.state.applications) < 12
     reply = cluster.apply("large", *(large(f"x{n}") for n in range(6)), by=MALLORY)
     assert (reply.accepted, reply.code) == (False, "quota")
-    invariants.the_books_balance(cluster.state)
+    check(cluster.state)
 
 
 def test_a_plan_forgets_nothing() -> None:
@@ -92,7 +92,7 @@ def test_the_store_of_a_user_outlasts_a_restart_of_the_master() -> None:
     cluster.apply("app", process("small"), by=ALICE)
     cluster.restart_master()
     assert not submit(cluster, MALLORY, large("again")).accepted
-    invariants.the_books_balance(cluster.state)
+    check(cluster.state)
 
 
 def test_one_user_leaves_places_for_others() -> None:
