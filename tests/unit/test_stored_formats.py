@@ -42,7 +42,7 @@ MEMOS = [
         ),
         (
             '{"awaited": ["/ns/talker", 30.0, 4711], "watch": [["scan", 5.0, "active", 2.0], '
-            '["/scan"], ["/get"], false, true]}'
+            '["/scan"], ["/get"], false, true, []]}'
         ),
     ),
     (Memo(Awaited("/talker", 1.5)), '{"awaited": ["/talker", 1.5, 0], "watch": null}'),
@@ -60,7 +60,7 @@ MEMOS = [
     ),
     (
         Memo(watch=Watch(Health())),
-        '{"awaited": null, "watch": [["", 0.0, "", 0.0], [], [], true, false]}',
+        '{"awaited": null, "watch": [["", 0.0, "", 0.0], [], [], true, false, []]}',
     ),
 ]
 
