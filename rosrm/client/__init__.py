@@ -2,6 +2,7 @@
 
 client.py       the client: requests, listings, events, logs, waiting
 connecting.py   finds the master, with the settings that commands use
+event_feed.py   follows the event record, also across a journal gap
 waiting.py      waits for states of processes and hosts
 logs.py         reads the logs of processes from the slaves that hold them, or from an archive
 log_collection.py  requests new output of all processes for an archive

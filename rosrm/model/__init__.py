@@ -21,11 +21,14 @@ codec.py                conversion of values to JSON and back
 lazy.py                 mappings that are rendered and encoded at the first read
 spec_text.py            JSON of a spec
 remembered.py           cache of function results by the identity of the argument
-durations.py            bound of all times
+durations.py            bounds of all times
+sizes.py                size of values, for bounds of what is stored
+ledger.py               what each principal has in a store, and its bounds
 links.py                measurements of links between hosts
 arrays.py               the array of a job, and the placeholder of its index
 schedules.py            times at which a job starts again
 job_checks.py           rules for arrays and schedules
+stop_rules.py           rule for the stop of a process
 limits.py               rules for limits and scheduling of a process
 adoption.py             a running process that becomes the first instance, adoption_rules.py
 container_rules.py      rules for the container of a process

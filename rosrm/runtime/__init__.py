@@ -12,6 +12,10 @@ settings_check.py  check of a settings file, in a process of its own
 parent_death.py    end of a process with its parent
 oom_score.py       protection of an agent from the OOM killer
 timer_slack.py     exact ends of the waits of a process
+dispositions.py    handlers of signals that the starter does not ignore
+memory_file.py     files without a place on a disk
+crash_notes.py     notes of the running calls of plugins, for the next start
+path_calls.py      threads for calls on paths that users name
 worker.py          a thread for blocking work of a loop
 ros_wheels.py      the environment of ROS 2 from wheels
 """

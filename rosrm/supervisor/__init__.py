@@ -3,6 +3,7 @@
     __main__.py           start: subreaper, daemon, then the bare interpreter
     bare_interpreter.py   entry point of the bare interpreter
     server.py             event loop, the imperative shell around `rosrm.core.supervisor`
+    boot_timer.py         timer of the boot clock, for the waits of the event loop
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
     spawn.py              start of one process: fork, and what its child does until the exec
