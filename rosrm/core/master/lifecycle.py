@@ -557,9 +557,13 @@ def gone(
 def assignment_withdrawn(
     state: MasterState, event: happened.AssignmentWithdrawn, now: float
 ) -> None:
-    """Return a process to its place in the queue: the slave never fetched its assignment."""
+    """Return a process to its place in the queue: the slave never fetched its assignment.
+
+    So the slave has no open request, and its host gets no work until the slave asks again.
+    """
     instance = state.instances.get(event.instance.number)
     if instance is not None:
+        state.hosts.withdraw_request(instance.host)
         gone(state, instance, now, f"{instance.host.name} did not accept the assignment in time")
 
 

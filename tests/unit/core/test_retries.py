@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.commands import Assign, Redeliver, Withdraw
 from rosrm.core.master.state.backoff import Backoff, Retries
 from rosrm.core.slave import events
 from rosrm.model.orders import AmendInstance
@@ -157,6 +158,31 @@ def test_a_host_that_refuses_a_process_for_ever_is_tried_less_and_less() -> None
     cluster.restart_master()
     cluster.wait(30.0)
     assert 3 <= len(cluster.assigned()) <= 6
+
+
+class Unfetched(Cluster):
+    """A cluster whose host a reports readings, and never fetches an assignment."""
+
+    def assign(self, host: Machine, command: Assign) -> None:
+        if host.name != "a":
+            super().assign(host, command)
+
+    def _redeliver(self, command: Redeliver) -> None:
+        """Send nothing, because the assignment waits to be fetched."""
+
+    def _withdraw(self, command: Withdraw) -> None:
+        self.tell(happened.AssignmentWithdrawn(command.instance))
+
+
+def test_a_host_that_fetches_no_assignment_gets_none_until_it_asks_again() -> None:
+    """A process that fits on another host, too, does not wait for the best one for ever."""
+    cluster = Unfetched("a", Machine("b", busy={"memory": 0.3, "cpu": 0.1}))
+    cluster.with_processes(process("p"), process("q"))
+    cluster.wait(2.0 * cluster.settings.delivery_timeout)
+    assert (cluster.where("p"), cluster.where("q")) == (["b"], ["b"])
+    cluster.ask_for_work(cluster.machines["a"])
+    cluster.submit(process("r"))
+    assert cluster.state.instances[cluster["r"].owner].host.name == "a"
 
 
 def test_an_order_of_which_nothing_is_reported_ends_without_an_answer() -> None:
