@@ -60,10 +60,9 @@ def allow_every_host(process: Process) -> None:
 
 
 def review_refusals(state: MasterState, now: float) -> None:
-    """Let waiting processes be tried again on hosts that have refused them long enough ago."""
-    for name in (*state.queue, *state.set_aside):
-        process = state.processes[name]
-        if not process.excluded:
+    """Let processes be started on, or moved to, hosts that have refused them long enough ago."""
+    for process in state.processes.values():
+        if not process.excluded or process.phase.is_terminal:
             continue
         waiting = process.refusals.waiting(now)
         for host in [one for one in process.excluded if one not in waiting]:

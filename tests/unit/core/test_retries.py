@@ -11,7 +11,7 @@ from rosrm.core.master.state.backoff import Backoff, Retries
 from rosrm.core.slave import events
 from rosrm.model.orders import AmendInstance
 from rosrm.model.values import InstanceState, Limits, MigrationPolicy, NeighbourRule, ProcessSpec
-from tests.unit.core.cluster import GIB, Cluster, Machine, node, process
+from tests.unit.core.cluster import GIB, Cluster, Machine, movable, node, process
 
 
 class Broken(Machine):
@@ -147,6 +147,19 @@ def test_a_host_that_refused_a_process_is_tried_again_after_a_wait() -> None:
     del cluster.machines["a"].refuses["p"]
     cluster.wait(40.0)
     assert cluster.where("p") == ["a"]
+
+
+def test_a_running_process_moves_to_a_host_that_has_refused_it_long_ago() -> None:
+    """Its move is tried again, too."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.3, "cpu": 0.1}))
+    cluster.with_processes(movable("p"))
+    cluster.machines["b"].refuses["p"] = "its artifact was not fetched: no space left on device"
+    cluster.set_host("a", "drain")
+    cluster.wait(5.0)
+    assert list(cluster["p"].excluded) == ["b"]
+    del cluster.machines["b"].refuses["p"]
+    cluster.wait(120.0)
+    assert cluster.where("p") == ["b"]
 
 
 def test_a_host_that_refuses_a_process_for_ever_is_tried_less_and_less() -> None:
