@@ -112,7 +112,8 @@ def _pending(state: MasterState, superseded: AbstractSet[str]) -> Iterator[tuple
     for application in state.applications.values():
         is_superseded = application.name in superseded
         if not is_superseded:
-            for name in application.tasks.keys() & application.specs.keys():
+            open_ones = application.tasks.keys() | application.behind.keys()
+            for name in open_ones & application.specs.keys():
                 yield application.principal, application.specs[name]
         if is_superseded or application.tasks:
             number = application.reached if is_superseded else application.former

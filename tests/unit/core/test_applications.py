@@ -550,6 +550,53 @@ def test_a_replacement_can_pause_instead() -> None:
     assert cluster.state.applications["nav"].paused.startswith("p: it failed")
 
 
+def failed_return() -> Cluster:
+    """Return a cluster in which `p` could not be replaced by the version that returns."""
+    cluster = Cluster("a")
+    cluster.apply("nav", movable("p"))
+    cluster.wait(1.0)
+    cluster.apply("nav", new(movable("p")), process("q"), healthy_for=5.0)
+    cluster.wait(2.0)
+    cluster.machines["a"].refuses["p"] = "its file system is full"
+    cluster.finish("q", code=1)
+    cluster.wait(3.0)
+    assert program(cluster, "p") == ("new",)
+    assert (row(cluster).state, row(cluster).reason) == (
+        "degraded", "p is still of another version",
+    )  # fmt: skip
+    return cluster
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_failed_return_of_a_process_is_tried_again(restarted: bool) -> None:
+    """Else the version that was given up would run until somebody applies again."""
+    cluster = failed_return()
+    if restarted:
+        cluster.restart_master()
+    del cluster.machines["a"].refuses["p"]
+    cluster.wait(120.0)
+    assert (program(cluster, "p"), state_of(cluster)) == (("run", "it"), (1, []))
+    assert row(cluster).state == "running"
+
+
+def test_a_return_that_fails_again_and_again_is_tried_less_and_less() -> None:
+    """The wait doubles up to ten minutes."""
+    cluster = failed_return()
+    cluster.wait(1800.0, tick=0.5)
+    assert len(cluster.recorded("application_failed")) <= 8
+    assert program(cluster, "p") == ("new",)
+
+
+def test_a_process_that_is_cancelled_after_its_failed_return_does_not_start_again() -> None:
+    """It has nothing to return to any more."""
+    cluster = failed_return()
+    cluster.machines["a"].refuses.clear()
+    cluster.cancel("p")
+    cluster.wait(120.0)
+    assert cluster.phase("p") == "cancelled"
+    assert not cluster.state.applications["nav"].behind
+
+
 def test_a_first_version_has_nothing_to_return_to() -> None:
     """A process that fails leaves the others running."""
     cluster = Cluster("a")

@@ -16,7 +16,8 @@ runs, and cannot            stop it; its next start has the new spec
 is in transition            wait
 ==========================  ==================================================================
 
-A step that fails leads back to the former version of the application, unless there is none.
+A step that fails leads back to the former version of the application, unless there is none. Then a
+process that runs with another version is replaced later; the wait doubles with each failure.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import add_process, still_stopping
 from rosrm.core.master.schedules import change_between_runs
 from rosrm.core.master.state.applications import Application, Task
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.process import (
     WAITING,
     DesiredState,
@@ -57,13 +59,36 @@ from rosrm.wording import counted
 _STARTED: Final = (
     ProcessPhase.ASSIGNED, ProcessPhase.STARTING, ProcessPhase.RUNNING, ProcessPhase.BACKOFF,
 )  # fmt: skip
+#: First and longest time, in seconds, until a replacement that has failed is tried again.
+_WAITS: Final = (30.0, 600.0)
 
 
 def review(state: MasterState, now: float) -> None:
     """Take the next steps of all applications that are not as desired."""
     for application in list(state.applications.values()):
+        if application.behind:
+            _try_again(state, application, now)
         if application.tasks and not application.paused:
             _review(state, application, now)
+
+
+def _try_again(state: MasterState, application: Application, now: float) -> None:
+    """Replace the processes again whose replacement has failed long enough ago."""
+    for name, backoff in list(application.behind.items()):
+        if not _is_behind(state, application, name):
+            del application.behind[name]
+            state.save_application(application)
+        elif name not in application.tasks and now >= backoff.until:
+            application.reopen(name)
+
+
+def _is_behind(state: MasterState, application: Application, name: str) -> bool:
+    """Return True if a process that is to run runs with another version than the desired one."""
+    process, spec = state.processes.get(name), application.specs.get(name)
+    if process is None or spec is None or process.spec.application != application.name:
+        return False
+    is_live = not process.phase.is_terminal and process.wanted is not DesiredState.CANCEL
+    return is_live and state.spec_to_be(process) != spec
 
 
 def _review(state: MasterState, application: Application, now: float) -> None:
@@ -97,6 +122,7 @@ def _is_replaced(state: MasterState, name: str, task: Task) -> bool:
 
 def _end(state: MasterState, application: Application, name: str) -> None:
     del application.tasks[name]
+    application.behind.pop(name, None)
     state.save_application(application)
 
 
@@ -277,7 +303,12 @@ def _handle_fault(
     """Return to the former version, or pause; without one, end the task."""
     version, why = application.version, f"{name}: {task.fault}"
     if version is None or not application.former:
+        behind = application.behind.get(name, Backoff())
         _end(state, application, name)
+        application.returning = application.returning and bool(application.tasks)
+        if _is_behind(state, application, name):
+            behind.note(now, *_WAITS)
+            application.behind[name] = behind
         _note(state, application, now, EventKind.APPLICATION_FAILED, f"is degraded: {why}")
     elif version.rollout.on_failure == "pause":
         application.paused = why
@@ -315,6 +346,7 @@ def _set_wanted(
     same = number == application.wanted
     application.returning = bool(application.former and not former and number)
     application.wanted, application.former, application.paused = number, former, ""
+    application.behind.clear()
     names = state.names_of(application.name)
     found = differences(state, application.name, application.specs, names)
     ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Final
 
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.model.applications import RolloutPolicy
 from rosrm.model.codec import fields_from_plain, fields_to_plain, from_plain
 from rosrm.model.lazy import Plain
@@ -73,6 +74,8 @@ class Application:
         returning: the desired version was chosen because a newer one had failed.
         paused: why the replacement stopped halfway; "": it did not.
         tasks: name of each process that is not yet as desired.
+        behind: name of each process that no task replaces any more, because its replacement has
+            failed and no other version returns, to the back-off of the next try.
         newest: highest number of a version.
     """
 
@@ -85,6 +88,7 @@ class Application:
     returning: bool = False
     paused: str = ""
     tasks: dict[str, Task] = field(default_factory=dict)
+    behind: dict[str, Backoff] = field(default_factory=dict)
     newest: int = 0
 
     @property
@@ -130,7 +134,8 @@ _VERSION: Final = ("number", "defaulted", "rollout", "wall", "by", "note", "give
 def application_to_dict(application: Application) -> dict[str, Any]:
     """Return an application without its versions as JSON."""
     tasks = {name: fields_to_plain(task, _TASK) for name, task in application.tasks.items()}
-    return {**fields_to_plain(application, _APPLICATION), "tasks": tasks}
+    own = fields_to_plain(application, _APPLICATION)
+    return {**own, "tasks": tasks, "behind": list(application.behind)}
 
 
 def application_from_dict(name: str, item: Mapping[str, Any]) -> Application:
@@ -139,6 +144,7 @@ def application_from_dict(name: str, item: Mapping[str, Any]) -> Application:
     restored.tasks = {
         name: Task(**fields_from_plain(Task, plain, _TASK)) for name, plain in item["tasks"].items()
     }
+    restored.behind = {name: Backoff() for name in item.get("behind", ())}  # absent in older ones
     return restored
 
 
