@@ -550,6 +550,18 @@ def test_an_unknown_move_in_the_journal_is_dropped() -> None:
     )
 
 
+def test_the_source_of_a_dropped_move_has_its_restart_policy_again() -> None:
+    """The move had ordered its slave not to restart it."""
+    cluster = two_hosts()
+    begin(cluster, HandoffPhase.SHADOW)
+    (source,) = cluster.machines["a"].programs.values()
+    assert source.restart.when == "never"
+    cluster.intents["migration"]["p"]["plan"]["steps"][0]["kind"] = "teleport"
+    cluster.restart_master()
+    cluster.wait(5.0)
+    assert source.restart == cluster["p"].spec.restart
+
+
 def test_reports_of_another_handoff_are_ignored() -> None:
     """A report is ignored if its process, destination or handoff number does not match."""
     cluster = two_hosts()

@@ -267,6 +267,7 @@ def _discard_migration(
         source.recalled = True
     for instance in state.instances_of(process):
         instance.stopping = instance.id.number != process.owner
+    state.unamended[process.name] = PendingAmendment()  # the move may have ordered no restarts
     message = f"the move of {process.name} cannot be continued: {fault}"
     state.record(now, EventKind.MIGRATION_FORGOTTEN, message, process=process.name)
     state.emit(Intent("migration", process.name, None))
