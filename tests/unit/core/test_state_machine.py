@@ -27,6 +27,8 @@ from rosrm.core.slave import events
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.model.arrays import NO_ARRAY, ArrayMembership
 from rosrm.model.devices import Device, DeviceNeed
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Record
 from rosrm.model.schedules import NO_SCHEDULE, Schedule
 from rosrm.model.values import (
     GroupMembership,
@@ -173,6 +175,7 @@ class Play(RuleBasedStateMachine):
         self, backfill: bool, most: int, slots: int, first: str, second: str, loss: str,
         preemption: str | bool, rebalance: bool, devices: str,
     ) -> None:  # fmt: skip
+        self.submitted: dict[str, float] = {}
         self.cluster = Cluster(
             backfill=backfill, max_migrations=most, settle=3.0, suspect=1.0, lease=5.0,
             delivery_timeout=2.0, cooldown=2.0, hysteresis=0.4, order_retry=1.0,
@@ -232,7 +235,17 @@ class Play(RuleBasedStateMachine):
 
     def look(self, commands: Sequence[Command]) -> None:
         self.look_at_assignments(commands)
+        self.look_at_time_limits(commands)
         self.note_given_up()
+
+    def look_at_time_limits(self, commands: Sequence[Command]) -> None:
+        """Check that no job is stopped for its time limit before it can have run so long."""
+        for record in (command for command in commands if isinstance(command, Record)):
+            if record.kind is EventKind.SUBMITTED:
+                self.submitted[record.process] = self.cluster.now
+            elif record.kind is EventKind.OVERDUE:
+                limit = self.cluster.state.processes[record.process].spec.time_limit
+                assert self.cluster.now - self.submitted[record.process] >= limit, record
 
     def look_at_assignments(self, commands: Sequence[Command]) -> None:
         state = self.cluster.state
@@ -777,6 +790,12 @@ class Play(RuleBasedStateMachine):
         return table.condition_of(table.by_name[machine.name]).name
 
     # --- time and the master -------------------------------------------------------------
+
+    @rule(seconds=st.sampled_from([-2e9, -3600.0, 5.0, 3600.0, 2e9]))
+    def set_the_clock(self, seconds: float) -> None:
+        """Set the clock of the day of the master's machine; all durations stay as they are."""
+        self.cluster.clock_set_by += seconds
+        self.cluster.state.wall = self.cluster.wall
 
     @rule(seconds=st.sampled_from([0.05, 0.3, 0.3, 1.0, 2.5, 6.0]), quiet=chance)
     def time_passes(self, seconds: float, quiet: bool) -> None:
