@@ -132,6 +132,19 @@ def test_a_host_without_the_capability_is_no_destination():
     assert "freezing does not work on b" in " ".join(cluster.recorded("strategy_absent"))
 
 
+def test_a_host_on_which_the_check_failed_is_checked_again() -> None:
+    """One fault of a moment does not exclude the host until its slave restarts; it is told once."""
+    there = busy("b")
+    there.facts = RuntimeError("no memory left")
+    cluster = frozen(Host("a"), there)
+    cluster.wait(1500.0, tick=1.0)
+    assert len(there.asked) == 3
+    assert len(cluster.recorded("strategy_absent")) == 1
+    there.facts = {"version": "4.2"}
+    cluster.wait(601.0, tick=1.0)
+    assert cluster.migrate("p", "b").accepted
+
+
 def test_hosts_with_another_capability_are_no_destinations():
     """The strategy's own comparison of capabilities decides."""
     cluster = frozen(Host("a"), busy("b", "4.1"), busy("c"))

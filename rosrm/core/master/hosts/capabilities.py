@@ -33,9 +33,11 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RunExecutor
 from rosrm.wording import listed
 
-#: Seconds for an answer, and until an order without an answer is repeated.
+#: Seconds for an answer, until an order without an answer is repeated, and until a host is asked
+#: again where a strategy did not work.
 _PATIENCE: Final = 30.0
 _ASK_AGAIN: Final = 10.0
+_CHECK_AGAIN: Final = 600.0
 
 
 def ask_hosts(state: MasterState, now: float) -> None:
@@ -52,7 +54,8 @@ def _ask(state: MasterState, name: str, strategy: HostChecking, host: Host, now:
     incarnation = host.description.incarnation
     if known is not None and known.incarnation == incarnation and now < known.ask_at:
         return
-    answer = Answer(incarnation, ask_at=now + _ASK_AGAIN)
+    former = known.reason if known is not None and known.incarnation == incarnation else ""
+    answer = Answer(incarnation, reason=former, ask_at=now + _ASK_AGAIN)
     state.capability_answers[name, host.name] = answer
     try:
         executor = state.plugins.ask(
@@ -84,11 +87,12 @@ def note_answer(
     elif event.outcome is OrderOutcome.TIMEOUT:
         answer.ask_at = now + _ASK_AGAIN
     else:
-        answer.reason, answer.ask_at = event.reason, inf
-        state.record(
-            now, EventKind.STRATEGY_ABSENT, f"{strategy} does not work on {host}: {answer.reason}",
-            host=host, facts={"strategy": strategy},
-        )  # fmt: skip
+        former, answer.reason, answer.ask_at = answer.reason, event.reason, now + _CHECK_AGAIN
+        if answer.reason != former:
+            why = f"{strategy} does not work on {host}: {answer.reason}"
+            state.record(
+                now, EventKind.STRATEGY_ABSENT, why, host=host, facts={"strategy": strategy}
+            )
 
 
 def are_checked(state: MasterState, strategy: str) -> bool:
