@@ -1,7 +1,7 @@
 """The clocks of rosrm. No other module reads a clock of the machine; a rule of ruff checks this.
 
 Durations, deadlines, leases and fences need a clock that is never set and never stops. Only the
-boot clock is both: NTP sets the clock of the day, and `time.monotonic` stands still while the
+boot clock is both: NTP sets the clock of the day, and `time.monotonic` stops while the
 machine is suspended. All deadlines use the boot clock, so that two of them can be compared.
 """
 
@@ -21,7 +21,7 @@ def boot_time_ns() -> int:
 
 
 def awake_time() -> float:
-    """Return seconds of a clock that stands still while the machine is suspended.
+    """Return seconds of a clock that stops while the machine is suspended.
 
     For the measurement of work, such as the duration of a call. Never compare it with `boot_time`.
     """
@@ -35,7 +35,7 @@ def suspended_time() -> float:
 
 
 def wall_time() -> float:
-    """Return the unix time, which may be set at any time: for schedules, and for people to read."""
+    """Return the unix time, which may be set at any time: for schedules and displays."""
     return time.time()
 
 

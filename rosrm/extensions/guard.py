@@ -131,7 +131,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
     finally:
         if (
             os.getpid() != pid
-        ):  # a fork of the plugin, which would go on as a second master or slave
+        ):  # a fork of the plugin, which would continue as a second master or slave
             os._exit(1)
         if _notes is not None:
             _notes.end(slot)

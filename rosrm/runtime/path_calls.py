@@ -3,7 +3,7 @@
 On a file system that does not answer (a dead NFS server), an `open` or `stat` waits without a
 limit, and no signal ends it. So a loop hands such calls to a thread. The thread names each path
 before it touches the path (`at`). A call that is late keeps its thread, and the next calls get
-another one. After `PATIENCE` the loop is told that the path does not answer.
+another one. After `PATIENCE` the loop gets a `NoAnswer`.
 
 The number of late calls is bounded. One dead mount does not use up this bound, because no further
 call touches a network file system on which a late call waits.

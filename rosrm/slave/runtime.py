@@ -700,7 +700,7 @@ class SlaveRuntime:
 
 
 def _ignore(_outcome: object) -> None:
-    """Take an outcome that nobody waits for."""
+    """Ignore an outcome."""
 
 
 def _random_number() -> int:

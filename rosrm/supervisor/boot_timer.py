@@ -1,6 +1,6 @@
 """A timer of the boot clock that a selector can wait for.
 
-The time-out of a selector stands still while the machine is suspended: a fence that expired in that
+The time-out of a selector stops while the machine is suspended: a fence that expired in that
 time would be seen too late by the whole rest of the wait. This timer fires at the resume.
 """
 

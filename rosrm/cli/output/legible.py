@@ -32,7 +32,7 @@ codecs.register_error(HANDLER, _number)
 
 
 def never_fail() -> None:
-    """Let the standard streams accept every text; the last defence of texts that nobody checks."""
+    """Let the standard streams accept every text that no other check has made legible."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors=HANDLER)

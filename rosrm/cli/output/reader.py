@@ -21,7 +21,7 @@ _AGAIN: Final = 0.5
 
 @contextmanager
 def needed() -> Iterator[None]:
-    """Exit with 1, as after a broken pipe, as soon as nobody can read standard output."""
+    """Exit with 1, as after a broken pipe, as soon as the reader of standard output has gone."""
     try:
         descriptor = sys.stdout.fileno()
     except OSError:  # of a caller in Python

@@ -260,7 +260,7 @@ class Destination:
         return not self._has_lost_history()
 
     def _has_lost_history(self) -> bool:
-        """Fail if nobody knows which messages of an input the source has processed."""
+        """Fail if it is unknown which messages of an input the source has processed."""
         topic = self._entities.input_known(Known.LOST)
         if topic:
             self._end(

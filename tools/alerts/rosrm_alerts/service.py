@@ -91,7 +91,7 @@ class AlertService:
             self._is_first = self._is_first and events is None
             events = ()
         observed = self._watch.observe(clocks.boot_time(), situation, map(_seen, events))
-        wall = clocks.wall_time()  # for people; a duration by it would end when the clock is set
+        wall = clocks.wall_time()  # for displays; a duration by it would end when the clock is set
         changes = [replace(change, time=wall) for change in observed]
         for change in changes:
             _log.info("alert %s %s: %s", change.alert.name, change.kind, change.message)

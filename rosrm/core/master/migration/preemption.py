@@ -263,7 +263,7 @@ def _expired(state: MasterState, search: _Search, claim: RoomMade, now: float) -
 def _given_up(
     state: MasterState, search: _Search, claim: RoomMade, why: str, now: float
 ) -> RoomMade:
-    """Return the outcome for a host where room was made in vain; it is tried again later."""
+    """Return the outcome for a host where room was made without success; it is tried later."""
     search.tried.note(_name_of(claim), why, now, _LONGEST)
     return RoomMade(None, why, now + state.settings.cooldown, tried=search.tried)
 

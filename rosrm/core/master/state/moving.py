@@ -45,7 +45,7 @@ class Preemption:
     reviewed: float = -inf
 
     def forget(self, host: str) -> None:
-        """Forget where room was made in vain, because the host has changed."""
+        """Forget where room was made without success, because the host has changed."""
         for room in self.room_made.values():
             room.tried.forget(host)
 

@@ -279,7 +279,7 @@ class Process:
         standby_reason: condition of its standby, for listings.
         started_at: time at which it first started since it left the queue; inf: not yet, or its
             host has not yet reported for how long it has run.
-        began: unix time of `started_at`, for people; 0: not yet.
+        began: unix time of `started_at`, for displays; 0: not yet.
         ran_before: seconds from that start to the start of its owner, after moves, as a former
             master or a lost host left it.
         overdue: True: its time limit has passed, and it is being stopped.
