@@ -115,7 +115,7 @@ def test_hostile_events_leave_a_sound_supervisor(stream):
         assert len(core.dead) <= supervision.MOST_TOMBSTONES
         for key, instance in core.instances.items():
             assert instance.key == key
-            messages.encode_status(messages.Status.of(instance))
+            messages.encode_status(messages.Status.of(instance, now))
             line({name: getattr(instance, name) for name in type(instance).__slots__})
             assert instance.ended or instance.phase in (
                 "held",
