@@ -29,11 +29,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
-from rosrm import clocks
-
 if not __package__:
     sys.path += [str(Path(__file__).resolve().parents[2]), sys.argv.pop(1)]
 
+from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm_criu.engine import image, process_tree, put_back, restore, restore_result
