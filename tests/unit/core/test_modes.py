@@ -372,6 +372,39 @@ def test_a_condition_whose_mode_cannot_be_reached_changes_nothing() -> None:
     assert failed.startswith("b is lost, but the mode docked cannot be reached: charger would wait")
 
 
+def unreached() -> Cluster:
+    """Return a cluster with a condition whose mode finds no host, because both are away."""
+    degraded = replace(DOCKED, when=Trigger(host_lost="b"))
+    cluster = in_mode("exploring", EXPLORING, degraded)
+    cluster.cut("a", "b", seconds=14.0)
+    assert states(cluster) == {"exploring": "in force", "docked": ""}
+    assert len(cluster.recorded("mode_failed")) == 1
+    return cluster
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_mode_is_reached_later_if_its_condition_still_holds(restarted: bool) -> None:
+    """All hosts were away when it began to hold; it is recorded once that the mode must wait."""
+    cluster = unreached()
+    if restarted:
+        cluster.restart_master()
+    cluster.reconnect("a", seconds=60.0)
+    if restarted:
+        cluster.rejoin("a", 60.0)
+    assert states(cluster)["docked"] != ""
+    assert len(cluster.recorded("mode_failed")) <= 2
+
+
+def test_a_switch_ends_the_tries_to_reach_another_mode() -> None:
+    """The operator has decided, while the condition of the other mode holds."""
+    cluster = unreached()
+    cluster.reconnect("a", seconds=0.1)
+    assert cluster.state.modes.retries
+    assert switch(cluster, "exploring").accepted
+    cluster.wait(60.0)
+    assert states(cluster)["docked"] == ""
+
+
 # --- limits and weights -----------------------------------------------------------------------
 
 

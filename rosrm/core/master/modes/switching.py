@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from math import inf
+from typing import Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import requests as applications
@@ -26,6 +27,7 @@ from rosrm.core.master.commands import Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.modes.settings import apply_settings, weighted
 from rosrm.core.master.outcomes import RequestRefused
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import Host, HostCondition
 from rosrm.core.master.state.modes import Modes
 from rosrm.core.master.state.process import Process, ProcessPhase
@@ -35,6 +37,10 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.modes import Mode, ModeRow, Trigger
 from rosrm.model.requester import OPERATOR, Requester
 from rosrm.wording import counted, few, listed, no_such
+
+#: First and longest time, in seconds, until a mode whose condition holds is tried again.
+_WAITS: Final = (2.0, 60.0)
+
 
 # --- requests ---------------------------------------------------------------------------------
 
@@ -133,6 +139,8 @@ def _switch(
     modes, targets = state.modes, _targets(state, mode)
     message, actions = applications.execute(state, targets, by, now)
     modes.wanted, modes.switching, modes.began = mode.name, True, now
+    modes.met += [name for name in modes.retries if name in modes.known]
+    modes.retries.clear()
     names = [target.application for target in targets]
     modes.versions = {name: state.applications[name].wanted for name in names}
     if not returns:
@@ -228,18 +236,23 @@ def _handle_fault(state: MasterState, mode: Mode, fault: str, now: float) -> Non
 
 
 def _review_trigger(state: MasterState, mode: Mode, now: float) -> None:
-    """Switch to a mode whose condition begins to hold."""
+    """Switch to a mode whose condition begins to hold; try again while it cannot be reached."""
     modes = state.modes
     holds = _holds(state, mode.when, now)
+    if not holds:
+        modes.retries.pop(mode.name, None)
     if holds is None or holds == (mode.name in modes.met):
         return
     if not holds:
         modes.met.remove(mode.name)
         state.save_modes()
         return
-    modes.met.append(mode.name)
-    state.save_modes()
     if mode.name == modes.wanted:
+        modes.met.append(mode.name)
+        state.save_modes()
+        return
+    backoff = modes.retries.setdefault(mode.name, Backoff())
+    if now < backoff.until:
         return
     by = Requester(modes.loaded_by.name, is_operator=True)
     try:
@@ -250,7 +263,11 @@ def _review_trigger(state: MasterState, mode: Mode, now: float) -> None:
             return
     except RequestRefused as refusal:
         fault = str(refusal)
+    backoff.note(now, *_WAITS)
+    if backoff.tries > 1:
+        return
     modes.fault[mode.name] = fault
+    state.save_modes()
     text = f"{mode.when}, but the mode {mode.name} cannot be reached: {fault}"
     state.record(now, EventKind.MODE_FAILED, text, facts={"mode": mode.name})
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from math import inf
 from typing import Any, Final
 
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.model.codec import fields_from_plain, fields_to_plain, from_plain, to_plain
 from rosrm.model.modes import Mode
 from rosrm.model.requester import Requester
@@ -27,6 +28,8 @@ class Modes:
         began: start of the switch by this master's clock; -inf: before this master started.
         fault: mode to the reason why it was left or not reached.
         met: modes whose condition holds; it puts a mode into force only when it begins to hold.
+        retries: modes whose condition holds, and which could not be reached yet, to the back-off of
+            the next try; any switch ends these tries.
     """
 
     known: dict[str, Mode] = field(default_factory=dict)
@@ -38,6 +41,7 @@ class Modes:
     began: float = -inf
     fault: dict[str, str] = field(default_factory=dict)
     met: list[str] = field(default_factory=list)
+    retries: dict[str, Backoff] = field(default_factory=dict)
 
     @property
     def mode(self) -> Mode | None:
