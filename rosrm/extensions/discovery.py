@@ -144,7 +144,7 @@ def definition(function: object) -> str:
     try:
         target: Any = inspect.unwrap(function)  # type: ignore[arg-type]
         return f"{inspect.getsourcefile(target)}:{inspect.getsourcelines(target)[1]}"
-    except (TypeError, OSError):
+    except BaseException:  # noqa: BLE001 - no source, or an object with any attributes
         return ""
 
 

@@ -9,7 +9,7 @@ import logging
 import os
 import threading
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Final, NamedTuple, Protocol, TypeVar
 
 from rosrm.errors import PluginError, describe_plugin_fault
@@ -127,7 +127,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
             interrupts.end()
             changed = before.restore()
             if changed and logging.getLogger().handlers:  # a command has no log
-                _log.warning("%s: %s has changed %s, restored now", whom, hook, listed(changed))
+                _say_changed(" ".join(filter(None, (whom, hook))), listed(changed))
     finally:
         if (
             os.getpid() != pid
@@ -135,6 +135,11 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
             os._exit(1)
         if _notes is not None:
             _notes.end(slot)
+
+
+@lru_cache(maxsize=1_000)  # once, because a policy may do so in each of a thousand calls
+def _say_changed(whom: str, changed: str) -> None:
+    _log.warning("%s has changed %s, restored now", whom, changed)
 
 
 def _without_interrupt(call: Callable[[], T]) -> T:

@@ -237,14 +237,17 @@ def required(answer: object, kind: type[T]) -> T:
 
 def with_place(fault: PluginError, owner: object, method: str) -> str:
     """Return the text about an invalid answer, with the place of the plugin's method."""
-    place = _place_of(owner, method)
+    try:
+        place = _place_of(owner, method)
+    except BaseException:  # noqa: BLE001 - the method may be an object with any attributes
+        place = ""
     return f"{fault} ({place})" if place else str(fault)
 
 
 def _place_of(owner: object, name: str) -> str:
     """Return file and line of the definition of a method or property; "": rosrm's, or unknown.
 
-    No code of the plugin runs, and no file is read.
+    No file is read, and no code of the plugin runs but that of a method that is no function.
     """
     found = getattr_static(owner, name, None)
     if isinstance(found, MemberDescriptorType):

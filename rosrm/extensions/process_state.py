@@ -15,6 +15,7 @@ import signal
 import socket
 import sys
 import threading
+import warnings
 
 # Without the conversion to enumerations, which takes most of the time of `signal.getsignal`.
 from _signal import getsignal  # type: ignore[import-not-found]
@@ -58,7 +59,7 @@ class ProcessState:
     def keep_own(self) -> None:
         """Take the present handlers of signals and garbage collection, which rosrm has changed."""
         self._handlers = [getsignal(number) for number in _SIGNALS]
-        self._collects = gc.isenabled()
+        self._collects = gc.isenabled(), gc.get_threshold()
 
     def restore(self) -> list[str]:
         """Restore what has changed since; return what it was. No effect in another thread."""
@@ -83,8 +84,10 @@ class ProcessState:
             if read() != before:
                 write(before)
                 changed.append(name)
-        if gc.isenabled() != self._collects:
-            (gc.enable if self._collects else gc.disable)()
+        if (gc.isenabled(), gc.get_threshold()) != self._collects:
+            enabled, thresholds = self._collects
+            gc.set_threshold(*thresholds)
+            (gc.enable if enabled else gc.disable)()
             changed.append("the garbage collection")
         return changed + (self._restore_of_kernel() if self._whole else [])
 
@@ -99,7 +102,30 @@ class ProcessState:
             with contextlib.suppress(OSError):  # removed
                 os.chdir(self._directory)
             changed.append("the working directory")
+        silenced = [one for one in _own_logs() if one.disabled]  # `dictConfig` does so by default
+        for one in silenced:
+            one.disabled = False
+        if silenced:
+            changed.append("the loggers of rosrm")
         return changed
+
+
+def _own_logs() -> list[logging.Logger]:
+    loggers = list(logging.root.manager.loggerDict.items())
+    return [
+        one for name, one in loggers if isinstance(one, logging.Logger) and name.startswith("rosrm")
+    ]
+
+
+def _raised_warnings() -> list[Any]:
+    """Return the filters by which a warning is raised, also in a decision of the core itself."""
+    return [one for one in warnings.filters if one[0] == "error"]
+
+
+def _raise_warnings(before: list[Any]) -> None:
+    kept = [one for one in warnings.filters if one[0] != "error" or one in before]
+    warnings.resetwarnings()  # so that no warning remembers the filters of before
+    warnings.filters[:] = kept  # type: ignore[index]
 
 
 #: Further settings: how to read and to write them, and their names.
@@ -107,6 +133,8 @@ _SETTINGS: Final[tuple[tuple[Callable[[], Any], Callable[[Any], Any], str], ...]
     (sys.getswitchinterval, sys.setswitchinterval, "the switch interval of threads"),
     (sys.getrecursionlimit, sys.setrecursionlimit, "the recursion limit"),
     (socket.getdefaulttimeout, socket.setdefaulttimeout, "the time-out of sockets"),
+    (gc.get_debug, gc.set_debug, "the debugging of the garbage collection"),
+    (_raised_warnings, _raise_warnings, "which warnings raise"),
 )
 
 

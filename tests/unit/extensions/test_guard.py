@@ -11,6 +11,8 @@ import socket
 import sys
 import threading
 import time
+import warnings
+import xmlrpc.client
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ import numpy as np
 import pytest
 
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.extensions.discovery import definition
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.extensions.plugin_deadline import Deadlines
@@ -166,6 +169,10 @@ def _take_signals() -> None:
         signal.signal(number, _ignore)
 
 
+def _configure_the_log() -> None:
+    logging.getLogger("rosrm.plugins").disabled = True  # as `dictConfig` does by default
+
+
 HARM: dict[str, Callable[[], Any]] = {
     "signals": _take_signals,
     "ignored": lambda: signal.signal(signal.SIGTERM, signal.SIG_IGN),
@@ -180,6 +187,10 @@ HARM: dict[str, Callable[[], Any]] = {
     "disabled log": lambda: logging.disable(logging.CRITICAL),
     "level of the log": lambda: logging.getLogger().setLevel(logging.CRITICAL),
     "handlers of the log": logging.getLogger().handlers.clear,
+    "configuration of the log": _configure_the_log,
+    "thresholds of the collection": lambda: gc.set_threshold(0),
+    "debugging of the collection": lambda: gc.set_debug(gc.DEBUG_SAVEALL),
+    "warnings that raise": lambda: warnings.simplefilter("error"),
 }
 
 
@@ -192,6 +203,8 @@ def _state() -> tuple[object, ...]:
     settings = (
         sys.getswitchinterval(), sys.getrecursionlimit(), gc.isenabled(),
         socket.getdefaulttimeout(), np.geterr(), signal.pthread_sigmask(signal.SIG_BLOCK, ()),
+        gc.get_threshold(), gc.get_debug(), "error" in [one[0] for one in warnings.filters],
+        logging.getLogger("rosrm.plugins").disabled,
     )  # fmt: skip
     return (
         settings,
@@ -210,7 +223,7 @@ def test_what_a_plugin_changes_in_the_process_is_restored(
 ) -> None:
     """Signals, log, umask and further settings are as before the call, and a warning says so."""
     before = _state()
-    _by_guard(HARM[harm])
+    guarded(HARM[harm], whom=f"filter {harm!r}", hook="mask")
     assert _state() == before
     assert "has changed" in caplog.text
 
@@ -222,6 +235,41 @@ def test_what_a_plugin_changes_in_a_decision_is_restored_within_a_second(harm: s
     _by_deadline(HARM[harm])
     state.restore()
     assert _state() == before
+
+
+def test_what_rosrm_has_changed_itself_stays() -> None:
+    """The end of the start sets the thresholds of the collection for the time of the service."""
+    state, before = ProcessState(), gc.get_threshold()
+    gc.set_threshold(12_345)
+    try:
+        state.keep_own()
+        assert state.restore() == []
+        assert gc.get_threshold()[0] == 12_345
+    finally:
+        gc.set_threshold(*before)
+
+
+def test_a_plugin_that_changes_the_process_in_each_call_is_named_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """A policy that sets the errors of numpy in each call fills no disk with warnings."""
+    calls = PluginCalls(Deadlines(5.0))
+    for _ in range(20):
+        calls.ask("scoring", "numeric", "score", lambda: np.seterr(all="ignore"))
+    (said,) = caplog.messages
+    assert said.startswith("scoring policy 'numeric' has changed the errors of numpy")
+
+
+def test_a_method_of_any_kind_costs_one_call() -> None:
+    """The place of a method is unknown if it is an object that has every attribute."""
+    endless = xmlrpc.client.ServerProxy("http://127.0.0.1:1").read
+    assert definition(endless) == ""
+
+    class Remote:
+        read = endless
+
+    with pytest.raises(PluginError, match="answered a int"):
+        guarded(lambda: required(3, str), whom="probe 'remote'", hook="read", of=Remote())
 
 
 def _endless() -> None:
