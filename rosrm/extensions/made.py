@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
+from operator import methodcaller
 from typing import Any, Final
 
 from rosrm.errors import PluginError
@@ -229,4 +231,5 @@ def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
 def close_quietly(probe: Probe) -> None:
     """Close a probe that is not used; ignore a failure."""
     with contextlib.suppress(PluginError):
-        guarded(probe.close, whom=f"probe {type(probe).__name__}", hook="close", seconds=1.0)
+        close = partial(methodcaller("close"), probe)
+        guarded(close, whom=f"probe {type(probe).__name__}", hook="close", seconds=1.0)

@@ -29,6 +29,7 @@ from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import methodcaller
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
@@ -388,7 +389,7 @@ class _Watched:
 
     def close(self) -> None:
         """Close the probe, in the thread that reads it."""
-        self.closed = self._guarded("close", self._probe.close)[1] == ""
+        self.closed = self._guarded("close", methodcaller("close"), self._probe)[1] == ""
 
     def _read(self) -> None:
         started = self._clock()

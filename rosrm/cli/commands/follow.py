@@ -109,6 +109,7 @@ def events(  # noqa: PLR0917 - an argument for each option
 def _write_mcap(path: Path, rows: Iterable[EventRow]) -> None:
     """Write events to a new MCAP file, until they end or Ctrl-C."""
     from contextlib import closing
+    from operator import methodcaller
 
     from rosrm.extensions.guard import guarded
     from rosrm.extensions.registry import Registry
@@ -120,8 +121,8 @@ def _write_mcap(path: Path, rows: Iterable[EventRow]) -> None:
         try:
             for row in rows:
                 guarded(
-                    partial(sink.send, [notice_of(row)]), whom="sink 'mcap'", hook="send",
-                    lets=(NoticesRefused,),
+                    partial(methodcaller("send", [notice_of(row)]), sink), whom="sink 'mcap'",
+                    hook="send", lets=(NoticesRefused,),
                 )  # fmt: skip
                 written += 1
         finally:

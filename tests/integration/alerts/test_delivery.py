@@ -1,5 +1,6 @@
 """Notices wait on disk until their sink has taken them."""
 
+import threading
 from contextlib import closing
 
 import pytest
@@ -103,3 +104,55 @@ def test_a_second_process_is_refused(outbox, tmp_path):
     """Two would send each notice twice."""
     with pytest.raises(OutboxError, match="is another `rosrm alerts run` using it"):
         Outbox(tmp_path / "outbox.sqlite")
+
+
+class Unconnected:
+    """A sink whose methods are those of a connection that cannot be made at first."""
+
+    def __init__(self):
+        self.attempts, self.taken = 0, []
+
+    def __getattr__(self, name):
+        self.attempts += 1
+        if self.attempts == 1:
+            raise ConnectionError("no route")
+        return self.taken.append
+
+
+def test_a_sink_without_its_methods_for_a_moment_gets_its_notices_later(outbox, caplog):
+    """The search for the method is a part of the call, so its failure ends no thread."""
+    outbox.commit([("odd", notice(1))], 1, {})
+    sink = Unconnected()
+    delivery = Delivery("odd", sink, outbox, first_retry=0.01)
+    wait_until(lambda: not outbox.waiting("odd", 1), "an empty outbox")
+    delivery.close(10.0)
+    assert sink.taken == [[notice(1)]]
+    assert "ConnectionError: no route" in caplog.text
+
+
+class Hanging:
+    """A sink that takes nothing until it is released."""
+
+    def __init__(self):
+        self.asked, self.released = threading.Event(), threading.Event()
+
+    def send(self, _notices):
+        self.asked.set()
+        self.released.wait()
+
+    def close(self):
+        pass
+
+
+def test_a_sink_that_hangs_is_named_once(outbox, caplog):
+    """A connection without a time-out would otherwise be silent until the end."""
+    outbox.commit([("odd", notice(1))], 1, {})
+    sink = Hanging()
+    delivery = Delivery("odd", sink, outbox, patience=0.0)
+    assert sink.asked.wait(10.0)
+    delivery.look()
+    delivery.look()
+    sink.released.set()
+    delivery.close(10.0)
+    (said,) = [one for one in caplog.messages if "has not returned" in one]
+    assert said.startswith("sink odd: send has not returned for ")

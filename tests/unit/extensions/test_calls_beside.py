@@ -75,8 +75,8 @@ def _is_guarded(around: list[ast.AST], tree: ast.Module) -> bool:
         if isinstance(node, ast.Call):
             called = node.func
             name = called.attr if isinstance(called, ast.Attribute) else getattr(called, "id", "")
-            if name in GUARDS:
-                return True
+            if name in GUARDS and any(isinstance(one, ast.Lambda) for one in around):
+                return True  # otherwise the property itself would run before the guard
         if isinstance(node, ast.FunctionDef):
             names.add(node.name)
     handed = {
@@ -113,6 +113,8 @@ def test_the_finder_finds_a_call_beside_the_guard() -> None:
         ("strategy.propose(move)", False),
         ("calls.ask('migration', name, 'propose', lambda: strategy.propose(move), strategy)", True),
         ("def ask(): return strategy.propose(move)\ncalls.ask('m', name, 'propose', ask)", True),
+        ("guarded(strategy.propose, whom=name)", False),
+        ("guarded(partial(strategy.propose, move), whom=name)", False),
     ):
         tree = ast.parse(line)
         ((_, around),) = _accesses(tree, members)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 from functools import partial
+from operator import methodcaller
 from typing import Final
 
+from rosrm import clocks
 from rosrm.errors import PluginError
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import titled
@@ -17,6 +19,8 @@ from rosrm_alerts.outbox import Outbox
 #: Seconds before the first retry, and the most between two retries; each wait doubles.
 FIRST_RETRY: Final = 1.0
 LONGEST_RETRY: Final = 300.0
+#: Seconds after which a warning names a sink whose `send` has not returned.
+PATIENCE: Final = 60.0
 
 _log = logging.getLogger("rosrm.alerts")
 
@@ -32,10 +36,11 @@ class Delivery:
 
     def __init__(
         self, name: str, sink: EventSink, outbox: Outbox, batch: int = 1,
-        first_retry: float = FIRST_RETRY,
+        first_retry: float = FIRST_RETRY, patience: float = PATIENCE,
     ) -> None:  # fmt: skip
         self._name, self._sink, self._outbox, self._batch = name, sink, outbox, batch
-        self._first_retry = first_retry
+        self._first_retry, self._patience = first_retry, patience
+        self._sending_since: float | None = None
         self._wake, self._stop = threading.Event(), threading.Event()
         # A daemon, because a sink that hangs must not keep the process alive.
         self._thread = threading.Thread(target=self._run, name=f"sink {name}", daemon=True)
@@ -44,6 +49,16 @@ class Delivery:
     def notify(self) -> None:
         """Deliver new notices now."""
         self._wake.set()
+
+    def look(self) -> None:
+        """Warn once of a call of the sink that does not return."""
+        since = self._sending_since
+        if since is not None and clocks.boot_time() - since >= self._patience:
+            self._sending_since = None
+            _log.warning(
+                "sink %s: send has not returned for %s; its notices wait",
+                self._name, duration(self._patience),
+            )  # fmt: skip
 
     def close(self, timeout: float) -> None:
         """Deliver what waits, for at most `timeout` seconds, and close the sink."""
@@ -68,7 +83,8 @@ class Delivery:
                 _log.warning("sink %s: next attempt in %s", self._name, duration(retry))
                 self._stop.wait(retry)
         try:
-            guarded(self._sink.close, whom=titled("sink", self._name), hook="close")
+            close = partial(methodcaller("close"), self._sink)
+            guarded(close, whom=titled("sink", self._name), hook="close")
         except PluginError as fault:
             _log.warning("sink %s: close failed: %s", self._name, fault)
 
@@ -76,10 +92,11 @@ class Delivery:
         """Deliver all that waits; return False if an attempt failed."""
         while waiting := self._outbox.waiting(self._name, self._batch):
             notices = [one.notice for one in waiting]
+            self._sending_since = clocks.boot_time()
             try:
                 guarded(
-                    partial(self._sink.send, notices), whom=titled("sink", self._name),
-                    hook="send", lets=(NoticesRefused,),
+                    partial(methodcaller("send", notices), self._sink),
+                    whom=titled("sink", self._name), hook="send", lets=(NoticesRefused,),
                 )  # fmt: skip
             except NoticesRefused as refusal:
                 many = counted(len(waiting), "notice")
@@ -87,5 +104,7 @@ class Delivery:
             except PluginError as fault:
                 _log.warning("sink %s: %s", self._name, fault)
                 return False
+            finally:
+                self._sending_since = None
             self._outbox.delivered(waiting)
         return True

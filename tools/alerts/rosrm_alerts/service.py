@@ -82,6 +82,8 @@ class AlertService:
             closing.callback(self._disconnect)
             while not stop.is_set():
                 self._look()
+                for delivery in self._deliveries.values():
+                    delivery.look()
                 stop.wait(PERIOD)
 
     def _look(self) -> None:
