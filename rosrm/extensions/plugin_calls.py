@@ -158,11 +158,12 @@ class PluginCalls:
         found: list[tuple[Plugin, str]] = []
         failed, self._failed = self._failed, {}
         worked, self._worked = self._worked, set()
-        for plugin, noted in failed.items():
+        for plugin, noted in list(failed.items()):  # a thread may still note an error
             if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
                 found.append((plugin, noted.error))
         for plugin in worked - failed.keys():
-            self.failing[plugin].succeeded = True
+            if known := self.failing.get(plugin):  # a thread may note this after the end
+                known.succeeded = True
         for plugin, known in sorted(self.failing.items()):
             if known.succeeded and now - known.last >= WORKS_AFTER:
                 del self.failing[plugin]

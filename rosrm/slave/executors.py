@@ -6,6 +6,7 @@ import json
 import logging
 import math
 import threading
+from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
@@ -23,6 +24,8 @@ _log = logging.getLogger("rosrm.slave")
 
 #: Marks an error that is too recent to forget, although a later call has succeeded.
 _SINCE: Final = "; it has succeeded since"
+#: Most calls of one executor that have not returned after their time-outs; each keeps a thread.
+MOST_LATE: Final = 8
 #: Most letters of a result, as the master accepts it.
 MOST_LETTERS_OF_RESULT: Final = 1 << 20
 #: Takes the outcome of an executor.
@@ -54,6 +57,7 @@ class Executors:
         self._changed = changed
         self._clock = clock
         self._failed_at: dict[str, float] = {}
+        self._late: Counter[str] = Counter()
         self.failing = dict(broken)
 
     @property
@@ -79,22 +83,38 @@ class Executors:
             done: called in the loop with the outcome.
 
         Raises:
-            Refused: there is no executor of this name.
+            Refused: there is no executor of this name, or `MOST_LATE` calls of it hang.
         """
         offered = self._offered.get(name)
         if offered is None:
             there = ", ".join(sorted(self._offered)) or "none"
             raise Refused(f"no executor {name!r} on {here['host']}; there are: {there}")
+        if self._late[name] >= MOST_LATE:
+            raise Refused(
+                f"executor {name} on {here['host']}: {MOST_LATE} earlier calls of it have not "
+                "returned; restart the slave after the cause has been corrected"
+            )
         strategy, function = offered.strategy, offered.call
         place = definition(function)
-        late = f"executor {name} did not return within {timeout:g} s ({place})"
-        timer = threading.Timer(
-            min(timeout, threading.TIMEOUT_MAX), self._post, [partial(self._fail, strategy, late)]
-        )
+        is_late: bool | None = False  # None: it has returned
+
+        def note_late() -> None:
+            nonlocal is_late
+            if is_late is not None:
+                is_late = True
+                self._late[name] += 1
+                self._fail(
+                    strategy, f"executor {name} did not return within {timeout:g} s ({place})"
+                )
+
+        timer = threading.Timer(min(timeout, threading.TIMEOUT_MAX), self._post, [note_late])
         timer.daemon = True
         complete = {**arguments, "here": {**here, "options": dict(offered.options)}}
 
         def settle(outcome: ExecutorOutcome) -> None:
+            nonlocal is_late
+            self._late[name] -= bool(is_late)
+            is_late = None
             if outcome.code in ("", "unable"):
                 self._work(strategy)
             else:

@@ -35,7 +35,7 @@ from rosrm.core.master.start_order import start_order_fault
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.core.master.stores import check_number, check_store, make_room
-from rosrm.errors import PluginError
+from rosrm.errors import PluginError, plain_text
 from rosrm.extensions.contracts import SpecChecking
 from rosrm.extensions.declared_fields import container_conflict, no_standby
 from rosrm.extensions.plugin_calls import implements, required
@@ -270,7 +270,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
         try:
             state.declared.options_of(name, spec)
         except ValueError as fault:
-            return str(fault)
+            return plain_text(str(fault), lines=True)
         if not implements(strategy, SpecChecking):
             return ""
         return required(strategy.spec_fault(spec), str)

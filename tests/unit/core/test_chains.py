@@ -124,3 +124,36 @@ def test_a_chain_of_one_policy_with_a_weight_shows_the_weight():
     hosts, policy = verdicts(cluster)
     assert (policy, hosts["a"]["score"]) == ("2 x near", pytest.approx(2.0))
     assert hosts["a"]["reason"] == "2 x near 1.000 (for a)"
+
+
+class Odd:
+    """A policy whose scores are fit for numpy alone: numbers as texts, or by name of the host."""
+
+    def __init__(self, form):
+        self.form = form
+
+    def score(self, hosts, process):
+        values = dict.fromkeys(hosts.names, "2")
+        return Scores(self.form(values), reason=lambda _: "so")
+
+
+class Named:
+    """Numbers that are read as an array, and not by position."""
+
+    def __init__(self, values):
+        self.values = values
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(list(self.values.values()), dtype)
+
+    def __getitem__(self, name):
+        return self.values[name]
+
+
+@pytest.mark.parametrize("form", [lambda values: list(values.values()), Named])
+def test_scores_of_any_form_that_numpy_reads_are_explained(form):
+    """A decision shows the checked numbers, and asks the plugin's own object for none."""
+    cluster = chained(ScoringLink("odd", Odd(form)), ScoringLink("near", NEAR))
+    cluster.submit(process("p"))
+    hosts, _ = verdicts(cluster)
+    assert hosts["a"]["reason"] == "odd 2.000 (so) + near 1.000 (for a)"

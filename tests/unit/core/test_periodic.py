@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
+from decimal import Decimal
 from typing import Any
 
 import pytest
@@ -188,6 +189,15 @@ def test_a_policy_without_a_valid_pace_makes_no_checkpoint(policy, reason):
     (message,) = cluster.recorded("periodic_failed")
     assert reason in message
     assert cluster.phase("p") == "running"
+
+
+def test_a_pace_of_another_type_of_number_is_read_as_one():
+    """The core adds it to times, which not every type of number allows."""
+    host = Host()
+    cluster = running(pacing(Decimal(10)), host)
+    cluster.wait(35.0)
+    assert len(host.dumps) == 3
+    assert not cluster.recorded("plugin_failed")
 
 
 def test_a_host_without_criu_makes_no_checkpoint():

@@ -14,6 +14,7 @@ from rosrm.extensions.contracts import HostView, ProcessView, Scores
 from rosrm.extensions.plugin_calls import (
     RECORD_PERIOD,
     WORKS_AFTER,
+    Failing,
     Plugin,
     PluginCalls,
     required,
@@ -234,3 +235,30 @@ def test_a_property_of_a_plugin_that_raises_costs_one_decision(members: str) -> 
         cluster.checkpoint("p")
         cluster.migrate("p")
     assert "SystemExit: no driver" in cluster.recorded("plugin_failed")[0]
+
+
+def test_an_answer_that_arrives_while_the_failure_ends_leaves_no_trace() -> None:
+    """Threads note answers of launchers while the loop of the slave takes the changes."""
+    calls, plugin = PluginCalls(), ("launcher", "box")
+
+    class Crossed(dict[Plugin, Failing]):
+        def __contains__(self, key: object) -> bool:
+            known = super().__contains__(key)
+            calls.changes(100.0)  # of the loop, between the two steps of the thread
+            return known
+
+        def get(self, key: Any, default: Any = None) -> Any:
+            known = super().get(key, default)
+            calls.changes(100.0)
+            return known
+
+    calls.note(plugin, "no")
+    calls.changes(0.0)
+    calls.note(plugin, "")
+    calls.changes(1.0)
+    known, calls.failing = calls.failing, Crossed(calls.failing)
+    calls.note(plugin, "")
+    calls.failing = dict(calls.failing)
+    assert plugin in known
+    calls.note(("launcher", "other"), "no")
+    assert calls.changes(101.0) == [(("launcher", "other"), "no")]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from decimal import Decimal
 from typing import Any
 
 import pytest
@@ -179,6 +180,17 @@ def test_a_policy_that_raises_or_gives_an_invalid_choice_is_named(answer):
     (message,) = cluster.recorded("plugin_failed")
     assert message.startswith("the checkpoint policy 'asked' fails: choose: ")
     assert all(order.hosts == () for order in cluster.orders(ReplicateSnapshot)[ordered:])
+
+
+def test_a_choice_of_similar_types_is_ordered_in_the_declared_ones():
+    """A list, or a number that no message can hold, would fail after the call of the policy."""
+    policy = Asked()
+    cluster = running(policy, "a", "b")
+    policy.answer = CheckpointChoice([others(cluster)[0]], every=Decimal("2.5"))
+    cluster.wait(5.0)
+    order = cluster.orders(ReplicateSnapshot)[-1]
+    assert order.hosts == (others(cluster)[0],)
+    assert (type(order.every), order.every) == (float, 2.5)
 
 
 @pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import pytest
 
 from rosrm.core.master import events as happened
@@ -95,6 +98,19 @@ class Choosy:
         if spec.name == "raises":
             raise RuntimeError("no idea")
         return "" if spec.migration.options else "it wants options"
+
+
+def test_the_fault_of_an_option_is_bounded() -> None:
+    """Its text is the plugin's, and the refusal has to fit into a message."""
+
+    def refuse(_strategy: str, _spec: ProcessSpec) -> Any:
+        raise ValueError("\ud800" + "x" * 3_000_000)
+
+    cluster = Cluster("a", strategies={"choosy": Choosy()})
+    cluster.state.declared = replace(cluster.state.declared, options_of=refuse)
+    reply = cluster.submit(process("p", migration=MigrationPolicy("choosy")))
+    assert not reply.accepted
+    assert len(reply.message.encode()) < 10_000
 
 
 def test_a_submission_warns_of_two_nodes_of_one_name() -> None:

@@ -15,7 +15,7 @@ from rosrm.core.master.events import BAD_RESULT
 from rosrm.errors import CriuError, Refused
 from rosrm.extensions.made import OfferedExecutor
 from rosrm.extensions.plugin_calls import WORKS_AFTER
-from rosrm.slave.executors import Executors
+from rosrm.slave.executors import MOST_LATE, Executors
 from rosrm.testing import FakeClock
 from tests.waiting import PATIENCE
 
@@ -170,3 +170,20 @@ def test_an_unknown_executor_is_refused_with_those_that_there_are() -> None:
     """The refusal comes before any executor runs."""
     with pytest.raises(Refused, match=r"no executor 'wit' on alpha; there are: wait"):
         Rig(exits).executors.execute("wit", {}, 1.0, here=HERE, done=lambda *_: None)
+
+
+def test_an_executor_that_never_returns_costs_few_threads() -> None:
+    """A check of the host is repeated for ever, and each call that hangs keeps its thread."""
+    released = threading.Event()
+    rig = Rig(lambda _: released.wait() and {})
+    before = threading.active_count()
+    for _ in range(MOST_LATE):
+        rig.run(0.01)
+    for _ in range(30):
+        with pytest.raises(Refused, match=f"{MOST_LATE} earlier calls of it have not returned"):
+            rig.run(0.01)
+    assert threading.active_count() - before <= MOST_LATE
+    released.set()
+    for _ in range(MOST_LATE):
+        rig.posted.get(timeout=PATIENCE)()
+    assert rig.run()[0][0] == ""

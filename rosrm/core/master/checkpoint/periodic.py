@@ -167,10 +167,13 @@ def _pace(
 
 
 def sound_pace(pace: float | None) -> float | None:
-    """Return the pace unchanged; raise PluginError for a pace that breaks the contract."""
-    if pace is not None and not 0.0 < pace < inf:
-        raise PluginError(f"one every {pace} s; allowed: more than 0")
-    return pace
+    """Return the pace as a float; raise PluginError for a pace that breaks the contract."""
+    if pace is None:
+        return None
+    number = float(pace)
+    if not 0.0 < number < inf:
+        raise PluginError(f"one every {number} s; allowed: more than 0")
+    return number
 
 
 def _order(

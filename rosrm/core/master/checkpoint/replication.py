@@ -270,10 +270,11 @@ def _newest_size(replicas: Mapping[str, Replica]) -> int:
 
 
 def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> CheckpointChoice | None:
-    """Return the choice unchanged; raise PluginError for a choice that breaks the contract."""
+    """Return the choice in its declared types; raise PluginError if it breaks the contract."""
     if choice is None:
         return None
     required(choice, CheckpointChoice)
+    choice = CheckpointChoice(tuple(choice.hosts), float(choice.every))
     strange = [name for name in choice.hosts if name not in view.hosts or name == view.host]
     if strange or len(set(choice.hosts)) != len(choice.hosts):
         raise PluginError(

@@ -21,7 +21,7 @@ from rosrm.core.master.scheduling.filters import (
     first_of,
     refusals,
 )
-from rosrm.core.master.scheduling.host_views import host_view, process_view
+from rosrm.core.master.scheduling.host_views import checked_scores, host_view, process_view
 from rosrm.core.master.scheduling.proximity import unmet
 from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.host_arrays import TIE
@@ -66,12 +66,12 @@ class Part(NamedTuple):
     """Scores and reasons of one policy in a decision.
 
     Attributes:
-        scores: None: the policy failed.
+        values: the checked scores of the hosts by row; None: the policy failed.
         reasons: row to the policy's reason for the score of the host, or for the veto on it.
     """
 
     link: ScoringLink
-    scores: Scores | None
+    values: Sequence[float] | None
     reasons: Mapping[int, str]
 
 
@@ -109,12 +109,15 @@ class Moment:
     def _part(self, link: ScoringLink, scored: Sequence[int], others: Sequence[int]) -> Part:
         """Return scores and reasons of a policy; one call with one time-out covers both."""
         views = host_view(self.hosts), process_view(self.hosts, link.reads)
+        fits = np.isin(np.arange(len(self.hosts)), scored)
 
         def scores_and_reasons() -> Part:
-            scores = required(link.policy.score(*views), Scores)
-            vetoed = [at for at in others if scores.veto is not None and scores.veto[at]]
+            scores = link.policy.score(*views)
+            values, veto = checked_scores(scores, views[0], fits)
+            vetoed = [at for at in others if veto is not None and veto[at]]
             reasons = self._reasons(link, scores, "reason", scored)
-            return Part(link, scores, reasons | self._reasons(link, scores, "veto_reason", vetoed))
+            reasons |= self._reasons(link, scores, "veto_reason", vetoed)
+            return Part(link, values.tolist(), reasons)
 
         try:
             return self.plugins.ask("scoring", link.name, "score", scores_and_reasons, link.policy)
@@ -286,9 +289,9 @@ def _sum(parts: Sequence[Part], at: int) -> str:
     if len(parts) == 1 and parts[0].link.weight == 1.0:
         return parts[0].reasons.get(at, "")
     return " + ".join(
-        f"{part.link} {part.scores.value[at]:.3f} ({part.reasons[at]})"
+        f"{part.link} {part.values[at]:.3f} ({part.reasons[at]})"
         for part in parts
-        if part.scores is not None
+        if part.values is not None
     )
 
 
