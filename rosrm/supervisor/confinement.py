@@ -11,7 +11,7 @@ from typing import Final, NamedTuple, TypeVar
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
-from rosrm.supervisor.spawn import Attempt, Scheduler, ScheduleRefused, SpawnError
+from rosrm.supervisor.spawn import TRANSIENT, Attempt, Scheduler, ScheduleRefused, SpawnError
 from rosrm.wording import by_reason, listed
 
 #: In place of the descriptor of a control group.
@@ -64,6 +64,7 @@ class Confinement:
 
         Raises:
             SpawnError: it cannot be started, or its limits are required and cannot be enforced.
+            OSError: the system has no room for another process now.
         """
         self._check_cpus(limits)
         wanted = limits.wanted
@@ -139,6 +140,8 @@ class Confinement:
                     attempt = spawn(group, scheduler)
                 return (yield attempt), faults
             except OSError as error:
+                if error.errno in TRANSIENT:
+                    raise
                 fault = f"its control group cannot be entered: {error.strerror}"
                 # A supervisor beside this one may have removed the group, because it was empty.
                 faults = self._make_group(key, limits)

@@ -32,7 +32,7 @@ def limited(soft: int | None) -> Iterator[None]:
     """Give processes that are started in this context a soft limit; None: that of this process."""
     former = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft is not None:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, former[1]))
+        resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, former[1]), former[1]))
     try:
         yield
     finally:

@@ -16,6 +16,7 @@ reported in the notes.
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
@@ -311,9 +312,10 @@ class InstanceRecord:
 
     def _replace(self, text: bytes) -> None:
         file = atomic_file.replace(self._path, text, os.O_APPEND)
-        if self._file >= 0:
-            os.close(self._file)
-        self._file = file
+        former, self._file = self._file, file
+        if former >= 0:
+            with contextlib.suppress(OSError):  # the lines that it had are in the new file
+                os.close(former)
 
     def _open_old(self) -> None:
         """Use the existing record if no other was made, behind a tail that may be torn."""

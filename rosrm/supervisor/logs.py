@@ -145,7 +145,8 @@ class LogKeeper:
         if prepared is not None:
             os.close(prepared)
             if not opened:
-                _unlink(paths.log_file(self._state, *instance))
+                with contextlib.suppress(OSError):  # an empty file may stay
+                    _unlink(paths.log_file(self._state, *instance))
         log = self._logs.pop(instance, None)
         if log is not None:
             self._unchecked += log.look(self.limits)
@@ -187,10 +188,15 @@ class _Log:
 
     def __init__(self, path: str) -> None:
         self.path = path
-        with log_index.Index(path) as index:
-            self.base = index.mark(0).offset if index.count else 0
-            self.size = index.mark(index.count - 1).offset - self.base if index.count else 0
-            self._has_index = index.count > 0
+        self.base, self.size, self._has_index = 0, 0, False
+        try:
+            with log_index.Index(path) as index:
+                if index.count:
+                    self.base = index.mark(0).offset
+                    self.size = index.mark(index.count - 1).offset - self.base
+                    self._has_index = True
+        except OSError as error:  # a log without times is no reason against a start
+            own_log.write(f"the time index of {path} cannot be read: {error}")
         self._start: Mark | None = None  # of a program without output and index
 
     def begin(self, size: int, pid: int) -> None:
@@ -215,7 +221,8 @@ class _Log:
                 rotate(self.path, size, limits)
             except OSError as error:
                 own_log.write(f"{self.path} was truncated, but not rotated: {error}")
-            self.base, self.size = log_index.base(self.path) or 0, 0
+            with contextlib.suppress(OSError):  # `note` finds that the log is shorter
+                self.base, self.size = log_index.base(self.path) or 0, 0
         return grown
 
     def note(self, size: int, pid: int) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import sys
 import time
 from typing import Final
 
@@ -48,10 +49,17 @@ def _written(line: str) -> bool:
 
 
 def write_fault(text: str) -> None:
-    """Write a line, and the traceback of the exception that is being handled."""
-    import traceback  # noqa: PLC0415 - only a defect needs it
+    """Write a line, and the traceback of the exception that is being handled.
 
-    write(f"{text}\n{traceback.format_exc()}")
+    The module `traceback` would be imported by a descriptor, which may be what is missing.
+    """
+    _, fault, trace = sys.exc_info()
+    lines = [text, "Traceback (most recent call last):"]
+    while trace is not None:
+        code = trace.tb_frame.f_code
+        lines.append(f"  {code.co_filename}:{trace.tb_lineno} in {code.co_name}")
+        trace = trace.tb_next
+    write("\n".join([*lines, f"{type(fault).__name__}: {fault}"]))
 
 
 def _empty_if_full() -> None:

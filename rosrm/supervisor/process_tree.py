@@ -11,7 +11,8 @@ from __future__ import annotations
 import os
 import selectors
 import signal
-from collections.abc import Callable, Container, Iterable
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
 from typing import Final
 
 from rosrm.core.supervisor.events import Event, Exited, SessionEnded
@@ -36,12 +37,14 @@ class ProcessTrees:
         happened: receives an event for each change of an instance.
         groups: control groups of the instances, which have all their processes.
         reaped: called with the pid of an ended child that is not known as a leader; it may add it.
-        starting: children that are no leaders yet, although they may execute their programs.
+        starting: children that are no leaders yet, although they may execute their programs, each
+            with its instance.
     """
 
     def __init__(
         self, state: str, selector: selectors.BaseSelector, happened: Callable[[Event], None],
-        groups: InstanceGroups, reaped: Callable[[int], None], starting: Container[int] = (),
+        groups: InstanceGroups, reaped: Callable[[int], None],
+        starting: Callable[[], Mapping[int, Key]] = dict,
     ) -> None:  # fmt: skip
         self._groups = groups
         self._reaped = reaped
@@ -60,6 +63,7 @@ class ProcessTrees:
         self._most_watched = descriptors.most_watched()
         self._adopted: dict[int, Key | None] = {}
         self._strays: dict[Key, dict[int, int]] = {}
+        self._ends: deque[tuple[int, Exited]] = deque()  # of leaders, not reported yet
 
     # --- session leaders --------------------------------------------------------------------------
 
@@ -90,7 +94,13 @@ class ProcessTrees:
         return True
 
     def look(self, now: float) -> None:
-        """Find the ends of the processes that have no descriptor; called in each round."""
+        """Find the ends of the processes that have no descriptor; called in each round.
+
+        Do also what an error of the system has prevented before.
+        """
+        self._report_ends()
+        for key in [key for key, watched in self._strays.items() if not watched]:
+            self._look_for_strays(key)
         if now < self._next_look or not self._looked_at:
             return
         self._next_look = now + _LOOK_EVERY
@@ -102,6 +112,8 @@ class ProcessTrees:
 
     def deadline(self) -> float | None:
         """Return the time at which `look` has work; None: never."""
+        if self._ends or not all(self._strays.values()):
+            return 0.0
         return self._next_look if self._looked_at else None
 
     def owner_of(self, pid: int) -> Key | None:
@@ -130,20 +142,18 @@ class ProcessTrees:
 
     def _taken_over_ended(self, key: Key, pid: int) -> None:
         self._unwatch(self._taken_over.pop(pid))
-        self.watch_strays(key, self._left(key, pid))
-        left, memory = key in self._strays, self._groups.out_of_memory(key)
-        self._happened(Exited(key, UNKNOWN_EXIT, leftovers=left, out_of_memory=memory))
+        memory = self._groups.out_of_memory(key)
+        self._ends.append((pid, Exited(key, UNKNOWN_EXIT, leftovers=True, out_of_memory=memory)))
+        self._report_ends()
 
     # --- reaping ------------------------------------------------------------------------------
 
     def reap(self) -> None:
         """Take the exit status of every child that has ended, and report the ends of leaders."""
-        ended, has_children = [], True
         while True:
             try:
                 pid, status, usage = os.wait4(-1, os.WNOHANG)
             except ChildProcessError:
-                has_children = False
                 break
             if pid == 0:
                 break
@@ -162,21 +172,29 @@ class ProcessTrees:
                     self._has_others(key, pid),
                     self._groups.out_of_memory(key) if code else None,
                 )
-                ended.append((pid, exited))
-        if ended:
-            if has_children:  # otherwise none was adopted
-                self._look_at_adopted()
-            owners = set(self._adopted.values())
-            for pid, exited in ended:
-                self._leader_ended(pid, exited, exited.instance in owners)
+                self._ends.append((pid, exited))
+        self._report_ends()
 
-    def _leader_ended(self, pid: int, exited: Exited, adopted: bool) -> None:
-        if not exited.leftovers and not adopted:
-            self._happened(exited)
+    def _report_ends(self) -> None:
+        """Report the ends of leaders, with what they left.
+
+        No exit code may be lost: an end is removed only once all about it is known.
+
+        Raises:
+            OSError: the system has no room for a look at the other processes; `look` tries again.
+        """
+        if not self._ends:
             return
-        left = self._left(exited.instance, pid)
-        self.watch_strays(exited.instance, left)
-        self._happened(exited._replace(leftovers=bool(left)))
+        self._look_at_adopted()
+        owners = set(self._adopted.values())
+        while self._ends:
+            pid, exited = self._ends[0]
+            key = exited.instance
+            if exited.leftovers or key in owners:
+                self.watch_strays(key, self._left(key, pid))
+                exited = exited._replace(leftovers=key in self._strays)
+            self._ends.popleft()
+            self._happened(exited)
 
     def _has_others(self, key: Key, leader: int) -> bool:
         """Return True if an instance whose leader was just reaped may have other processes."""
@@ -205,9 +223,13 @@ class ProcessTrees:
 
     def _look_at_adopted(self) -> None:
         """Find the instance of each adopted child; kill it if that has no leader."""
+        starting = self._starting()
+        begun = set(starting.values())
         for pid in procfs.own_children():
-            if not any(pid in known for known in (self._children, self._adopted, self._starting)):
+            if not any(pid in known for known in (self._children, self._adopted, starting)):
                 key = self._owner(pid)
+                if key in begun and key not in self._sessions:
+                    continue  # its leader may execute its program already: a later look decides
                 self._adopted[pid] = key
                 if key is not None and key not in self._sessions:
                     own_log.write(f"killed {pid}, left over by {mark(key)}")
@@ -246,8 +268,11 @@ class ProcessTrees:
     def _stray_ended(self, key: Key, pid: int) -> None:
         watched = self._strays[key]
         self._unwatch(watched.pop(pid))
-        if watched:
-            return
+        if not watched:
+            self._look_for_strays(key)
+
+    def _look_for_strays(self, key: Key) -> None:
+        """Look for further strays after the end of all that were watched. Raises OSError."""
         self.watch_strays(key, self._find(key))
         if key not in self._strays:
             self._happened(SessionEnded(key))

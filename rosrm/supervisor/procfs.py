@@ -98,7 +98,8 @@ def open_pidfd(pid: int) -> int:
     except ProcessLookupError:
         raise
     except OSError:
-        os.kill(pid, 0)  # a refused call does not tell that the process has ended
+        with contextlib.suppress(PermissionError):  # it runs as another user
+            os.kill(pid, 0)  # a refused call does not tell that the process has ended
         return -1
 
 

@@ -103,8 +103,9 @@ class Server:
         self._groups = self._confinement.groups
         self._starts: dict[int, _Start] = {}  # by pid, before the exec
         self._trees = ProcessTrees(
-            state, self._selector, self._happened, self._groups, self._reaped, self._starts
-        )
+            state, self._selector, self._happened, self._groups, self._reaped,
+            lambda: {pid: start.key for pid, start in self._starts.items()},
+        )  # fmt: skip
         self._record = InstanceRecord(state)
         self._last_contact = lease_file.LastContact(state)
         self._logs = LogKeeper(state, limits)
@@ -142,29 +143,27 @@ class Server:
         for key, _ in self._selector.select(timeout):
             # A call may close the descriptor of a later event, such as the report of a start whose
             # end was noticed first. Its number may even belong to another descriptor by now.
-            if self._selector.get_map().get(key.fileobj) is not key:
-                continue
-            _guarded(key.data)
+            # Not looked up by `fileobj`: a connection that is closed by now has no descriptor.
+            if self._selector.get_map().get(key.fd) is key:
+                _guarded(key.data)
 
     def _round(self) -> None:
-        """Do everything that is due, without waiting."""
+        """Do everything that is due, without waiting; no part needs the success of another one."""
         if self._is_due():
             # After a SIGSTOP of this process: messages that came in time count first.
             self._take_in(0.0)
         if self._is_due():
             self._happened(events.TimePassed())
         now = clocks.boot_time()
-        self._logs.look(now)
-        self._trees.look(now)
-        self._groups.look(now)
-        self._abandon_late(now)
-        self._spawn_some()
+        for look in (self._logs.look, self._trees.look, self._groups.look, self._abandon_late):
+            _guarded(look, now)
+        _guarded(self._spawn_some)
         self._remove_groups()
         if self._record.is_large():
             self._rewrite_record()
         self._record.flush()
         self._report()
-        self._prepare_held()
+        _guarded(self._prepare_held)
         if self._served and self._client is None and self._core.idle:
             self._leaving = True
 
@@ -196,7 +195,7 @@ class Server:
 
     def _leave(self) -> None:
         self._groups.close()
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):  # the next supervisor replaces a socket that stays
             os.unlink(os.path.join(self._state, paths.SOCKET))
         if self._client is not None:
             self._client.finish(messages.encode_ended(), END_PATIENCE)
@@ -205,7 +204,7 @@ class Server:
 
     def _happened(self, event: Event) -> None:
         for command in self._core.handle(event, clocks.boot_time()):
-            self._execute(command)
+            _guarded(self._execute, command)  # the core counts on each of them
 
     def _execute(self, command: commands.Command) -> None:
         if isinstance(command, commands.ReportStatus):
@@ -225,7 +224,6 @@ class Server:
         instance = self._core.instances[key]
         if instance.ended:
             self._launches.pop(key, None)
-            self._logs.release(key)
         if not instance.pid and instance.phase != STOPPING:
             self._trees.release(key)
             if instance.ended:
@@ -241,14 +239,18 @@ class Server:
             self._first_starts[key] = status
         else:
             self._unsent.append(messages.encode_status(status))
+        if instance.ended:
+            self._logs.release(key)
 
     def _unspawn(self, key: Key) -> None:
         begun = [start for start in self._starts.values() if start.key == key]
-        for start in begun:
+        # One that executes its program by now is stopped as any other.
+        waiting = [start for start in begun if not start.attempt.read()]
+        for start in waiting:
             self._abandon(start)
         if key in self._spawns:
             self._spawns.remove(key)
-        elif not begun:
+        elif not waiting:
             return
         self._happened(SpawnFailed(key, ""))
 
@@ -292,17 +294,22 @@ class Server:
         self._record.spawning(keys)
         durable = self._record.flush()
         for key in keys:
-            if durable:
-                self._spawn(key)
-            else:
+            if not durable:
                 failed = f"not started, for it could not be recorded: {self._record.trouble}"
                 self._spawn_failed(key, failed, transient=True)
+                continue
+            try:
+                self._spawn(key)
+            except OSError as error:
+                self._spawn_failed(key, _no_room(error), transient=True)
 
     def _spawn(self, key: Key) -> None:
         launch = self._launches.get(key)
         if launch is not None and launch.adoption and not self._core.instances[key].started:
             self._adopt(key, launch, launch.adoption)
             return
+        if self._null < 0:
+            self._null = _open_null()
         try:
             self._check_former_start(key)
             program = self._program(launch)
@@ -312,7 +319,8 @@ class Server:
             return
 
         def begin(group: int, scheduler: spawn.Scheduler | None) -> spawn.Attempt:
-            return spawn.begin(program, self._null, log, group=group, scheduler=scheduler)
+            with score_of_children(), descriptors.limited(self._files):
+                return spawn.begin(program, self._null, log, group=group, scheduler=scheduler)
 
         assert launch is not None
         steps = self._confinement.start(key, launch.limits, begin)
@@ -340,12 +348,13 @@ class Server:
         """Continue a start, to its next attempt or to its end."""
         birth = procfs.ticks_now()
         try:
-            with score_of_children(), descriptors.limited(self._files):
-                start.attempt = step()
+            start.attempt = step()
         except StopIteration as done:
             self._started(start, done.value)
         except spawn.SpawnError as error:
             self._spawn_failed(start.key, str(error), error.transient)
+        except OSError as error:
+            self._spawn_failed(start.key, _no_room(error), transient=True)
         else:
             start.birth = birth
             self._starts[start.attempt.pid] = start
@@ -376,12 +385,14 @@ class Server:
         """Kill a process before its exec. It may end much later, so nothing waits for that."""
         self._stop_watching(start)
         os.close(start.log)
-        os.kill(start.attempt.pid, signal.SIGKILL)
         self._stuck[start.attempt.pid] = (start.key[0], start.attempt.step)
+        os.kill(start.attempt.pid, signal.SIGKILL)
 
     def _abandon_late(self, now: float) -> None:
         """Report the starts that a path holds up."""
         for start in [one for one in self._starts.values() if one.due <= now]:
+            if start.attempt.read():
+                continue  # this process was stopped, or the machine suspended: it is no longer late
             self._abandon(start)
             failed = f"{start.attempt.step} does not answer ({spawn.PATIENCE:g} s)"
             self._spawn_failed(start.key, failed, transient=True)
@@ -389,7 +400,7 @@ class Server:
     def _reaped(self, pid: int) -> None:
         """Note the end of a child that is no leader yet, and may have executed its program."""
         self._stuck.pop(pid, None)
-        while pid in self._starts:
+        if pid in self._starts:
             self._read_report(self._starts[pid])
 
     def _started(self, start: _Start, confined: Confined) -> None:
@@ -513,7 +524,9 @@ class Server:
 
         Otherwise the selector would report it in every round, without a wait.
         """
-        os.close(self._null)  # for a moment, because a connection needs a descriptor
+        spare, self._null = self._null, -1  # its number may soon be that of another file
+        if spare >= 0:
+            os.close(spare)  # for a moment, because a connection needs a descriptor
         with contextlib.suppress(OSError):
             self._listener.accept()[0].close()
         self._null = _open_null()
@@ -694,17 +707,21 @@ class Server:
         self._selector.register(file, selectors.EVENT_READ, call)
 
 
-def _guarded(call: Callable[[], None]) -> None:
+def _guarded(call: Callable[..., None], *args: object) -> None:
     """Call a part of the loop; log a failure of the system that the part does not handle.
 
     A full or failing disk must not end the parent of all processes. The pause bounds the work if
     the same failure follows at once.
     """
     try:
-        call()
+        call(*args)
     except OSError as fault:
         own_log.write_fault(f"a part of the loop failed: {fault}")
         time.sleep(PAUSE_AFTER_FAULT)
+
+
+def _no_room(error: OSError) -> str:
+    return f"it cannot be started now: {error.strerror}"
 
 
 def _open_null() -> int:

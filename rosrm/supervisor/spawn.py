@@ -19,7 +19,7 @@ from typing import Final, NamedTuple, NoReturn
 #: Seconds for the steps of one start; after them, the path of the current step has no answer.
 PATIENCE: Final = 10.0
 #: Errors that may pass: the same spawn is tried again where the restart policy allows.
-_TRANSIENT: Final = frozenset(
+TRANSIENT: Final = frozenset(
     {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.EIO}
 )
 #: Bytes of one read of a report.
@@ -79,15 +79,19 @@ class Attempt:
     """
 
     def __init__(self, pid: int, report: int) -> None:
+        os.set_blocking(report, False)
         self.pid = pid
         self.report = report
         self._told = b""
 
     def read(self) -> bool:
-        """Read a part of the report, which must be readable; return True at its end."""
-        part = os.read(self.report, _PART)
-        self._told += part
-        return not part
+        """Read what the report has now; return True at its end."""
+        try:
+            while part := os.read(self.report, _PART):
+                self._told += part
+        except BlockingIOError:
+            return False
+        return True
 
     def close(self) -> None:
         """Read no more of the report."""
@@ -131,7 +135,7 @@ def begin(
 
     Raises:
         SpawnError: no process can be forked.
-        OSError: the control group is gone.
+        OSError: the control group is gone, or the system has no room, see `TRANSIENT`.
     """
     report, told = os.pipe2(os.O_CLOEXEC)
     try:
@@ -242,7 +246,7 @@ def _execute(
         from rosrm.supervisor import exec_failures  # noqa: PLC0415 - only a failure needs it
 
         reason = exec_failures.reason(os.path.join(directory, path), error)
-        raise SpawnError(reason, transient=error.errno in _TRANSIENT) from None
+        raise SpawnError(reason, transient=error.errno in TRANSIENT) from None
     except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
         raise SpawnError(f"{word!r} cannot be started: {error}") from None
 

@@ -132,3 +132,32 @@ def test_a_signal_reaches_an_adopted_process_and_no_other_with_its_pid(tmp_path,
     finally:
         adopted.kill()
         adopted.wait()
+
+
+def test_a_daemon_of_a_leader_that_is_not_known_yet_is_no_leftover(tmp_path, capfd):
+    """Another process ends after the leader's exec, and before the supervisor notices the exec."""
+    starting = {1: TALKER}
+    its = ProcessTrees(
+        str(tmp_path), selectors.DefaultSelector(), lambda _: None, InstanceGroups(),
+        lambda _: None, lambda: starting,
+    )  # fmt: skip
+    marks = {procfs.INSTANCE_MARK: mark(TALKER), procfs.SUPERVISOR_MARK: str(tmp_path)}
+    daemon = subprocess.Popen(["sleep", "100"], start_new_session=True, env=marks)
+    try:
+        end_another(its)
+        assert "left over" not in capfd.readouterr().err
+        starting.clear()
+        end_another(its)
+        os.waitid(os.P_PID, daemon.pid, os.WEXITED)
+    finally:
+        daemon.kill()
+        daemon.wait()
+
+
+def end_another(its: ProcessTrees) -> None:
+    """Have the trees reap the leader of another instance."""
+    other = subprocess.Popen(["true"], start_new_session=True)
+    its.add_child(("other", 1), other.pid, procfs.ticks_now())
+    os.waitid(os.P_PID, other.pid, os.WEXITED | os.WNOWAIT)
+    its.reap()
+    other.poll()
