@@ -597,6 +597,18 @@ def test_a_process_that_is_cancelled_after_its_failed_return_does_not_start_agai
     assert not cluster.state.applications["nav"].behind
 
 
+def test_a_version_of_which_a_process_is_replaced_again_is_one_to_return_to() -> None:
+    """The process came back with a lost host, or its return had failed."""
+    cluster = Cluster(Machine("a", stubborn={"p"}))
+    cluster.apply("nav", process("p"))
+    cluster.wait(3.0)
+    cluster.state.applications["nav"].reopen("p")
+    cluster.apply("nav", process("p"), process("q"), healthy_for=5.0)
+    cluster.finish("q", code=1)
+    cluster.wait(3.0)
+    assert state_of(cluster) == (1, [])
+
+
 def test_a_first_version_has_nothing_to_return_to() -> None:
     """A process that fails leaves the others running."""
     cluster = Cluster("a")

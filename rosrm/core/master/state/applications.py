@@ -71,7 +71,8 @@ class Application:
         versions: kept versions by number, in order.
         wanted: number of the desired version; 0: none, the application is cancelled.
         former: number of the version to which a failed replacement returns; 0: none.
-        returning: the desired version was chosen because a newer one had failed.
+        returning: the desired version was reached before: a newer one has failed, or a process that
+            runs with another one is replaced.
         paused: why the replacement stopped halfway; "": it did not.
         tasks: name of each process that is not yet as desired.
         behind: name of each process that no task replaces any more, because its replacement has
@@ -109,8 +110,12 @@ class Application:
         return self.former if unreached else self.wanted
 
     def reopen(self, name: str) -> None:
-        """Note that a process runs with another spec than the desired one, and is replaced."""
+        """Note that a process runs with another spec than the desired one, and is replaced.
+
+        If no other work is open, the process returns to a version that was reached before.
+        """
         if name in self.specs:
+            self.returning = self.returning or not self.tasks
             self.tasks[name] = Task(replaces=True)
 
     def keep(self, number: int) -> list[int]:
