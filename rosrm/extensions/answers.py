@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import fields, is_dataclass
 from functools import cache
+from itertools import repeat
 from typing import Annotated, Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
 from rosrm.errors import PluginError, plain_text
@@ -81,14 +82,14 @@ class _Check:
         if issubclass(origin, tuple) and hints[-1:] != (Ellipsis,):
             if len(value) != len(hints):
                 return f"{where} has {len(value)} values; {len(hints)} are required"
-            each = tuple(hints)
+            each: Iterable[Any] = hints
         elif issubclass(origin, Sequence | AbstractSet):
-            each = (hints[0],) * len(value)
+            each = repeat(hints[0])
         else:  # an iterator can be read only once: its reader checks it
             return ""
         found = (
             self.fault(item, hint, f"{where}[{index}]")
-            for index, (item, hint) in enumerate(zip(value, each, strict=True))
+            for index, (item, hint) in enumerate(zip(value, each))  # noqa: B905 - the types repeat
         )
         return next(filter(None, found), "")
 

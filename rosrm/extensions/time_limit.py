@@ -13,6 +13,9 @@ import os
 import signal
 import sys
 import threading
+
+# Without the conversion to enumerations, which takes most of the time of `signal.signal`.
+from _signal import signal as install  # type: ignore[import-not-found]
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
@@ -59,7 +62,7 @@ def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> 
     alarm = _Alarm(inspect.currentframe(), clocks.awake_time() + seconds)
     outer, _Alarm.ringing = _Alarm.ringing, alarm
     # A process has one timer, so that of a test runner or of an outer limit is restored afterwards.
-    before = signal.signal(signal.SIGALRM, _ring)
+    before = install(signal.SIGALRM, _ring)
     left, interval = signal.setitimer(signal.ITIMER_REAL, seconds, _AGAIN)
     try:
         return call()
@@ -69,7 +72,7 @@ def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> 
         _Alarm.ringing = outer
         # The default action stays replaced, because a last alarm on its way would end the process.
         if callable(before) and before is not _ring:
-            signal.signal(signal.SIGALRM, before)
+            install(signal.SIGALRM, before)
         if left:
             signal.setitimer(signal.ITIMER_REAL, left, interval)
         if alarm.interrupt is not None:

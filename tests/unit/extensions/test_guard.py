@@ -13,7 +13,8 @@ import threading
 import time
 import warnings
 import xmlrpc.client
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
+from rosrm.extensions.answers import fault_of
 from rosrm.extensions.discovery import definition
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import PluginCalls, required
@@ -355,3 +357,15 @@ def test_calls_leave_nothing_in_memory() -> None:
 
 def _memory() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4
+
+
+@pytest.mark.parametrize("hint", [Sequence[int], AbstractSet[int], tuple[int, ...]])
+def test_an_answer_of_any_length_costs_no_memory(hint: Any) -> None:
+    """A range counts as a sequence of all its numbers, and any class may claim a length."""
+
+    class Long(tuple):  # type: ignore[type-arg] # noqa: SLOT001
+        def __len__(self) -> int:
+            return 1 << 62
+
+    for answer in (range(1 << 62), Long((1, "x"))):
+        assert fault_of(answer, hint, "it") != ""
