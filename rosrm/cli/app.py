@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final, NoReturn, TextIO
 
-from rosrm.cli.process import INTERRUPTED, NO_ROOM
+from rosrm.cli.process import INTERRUPTED
+from rosrm.runtime.atomic_file import NO_ROOM
 
 #: New objects after which Python looks for cycles: more than the imports of a command create, for
 #: which the default of 700 costs 10 % of a command's CPU time.

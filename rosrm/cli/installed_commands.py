@@ -18,12 +18,12 @@ from typing import Any, Final
 import typer
 
 from rosrm.cli.groups import CommandLineError, PlainCommand, add_command
-from rosrm.cli.process import NO_ROOM
 from rosrm.errors import PluginError, RosrmError, describe_plugin_fault
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.installed import COMMANDS, PluginAddress, installed_plugins
 from rosrm.extensions.process_state import Interrupts
 from rosrm.model.rows import PluginRow
+from rosrm.runtime.atomic_file import NO_ROOM
 from rosrm.wording import listed
 
 #: Seconds for the import of a command; nothing but the command waits for it.

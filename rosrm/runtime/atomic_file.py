@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 from typing import Final
 
 from rosrm.runtime.private_files import open_private, write_all
 
+#: Errors of a file, such as the output, that takes no more data: a full disk, a quota, a limit of
+#: the size of files, a disk that fails or is read-only.
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 #: Mode that `open_private` gives.
 _PRIVATE: Final = 0o600
 

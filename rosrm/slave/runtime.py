@@ -251,9 +251,7 @@ class SlaveRuntime:
     def _serve_master(self, max_age: float) -> None:
         """Offer the services of this slave, with those of snapshot replication."""
         config = self._config
-        self._state_disk = StateDisk(
-            self._paths, config.state, lambda fault: self._note_part("state directory", fault)
-        )
+        self._state_disk = StateDisk(self._paths, config.state, self._note_disk)
         self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
         self._replication = ReplicationService(
             self._snapshots, config.host, config.keep,
@@ -500,6 +498,12 @@ class SlaveRuntime:
                     failing["probe", resource] = f"probe {report.probe}: {report.reason}"
                 else:
                     failing.pop(("probe", resource), None)
+
+    def _note_disk(self, fault: str) -> None:
+        """Report whether the state directory takes data."""
+        self._note_part("state directory", fault)
+        if not fault:
+            self._starter.write_missing_keys()
 
     def _note_part(self, part: str, fault: str) -> None:
         """Log that a part of the host begins or ceases to fail, and report that to the master."""

@@ -166,8 +166,11 @@ def command_in_image(spec: ProcessSpec) -> tuple[str, ...]:
     return spec.command
 
 
-def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> str:
-    """Write the key of an instance beside its log and return the path; pruned with the log.
+def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> bool:
+    """Write the key of an instance beside its log, with which it is pruned.
+
+    Return False if the disk takes no data now. That refuses no start, as it may be over at once,
+    and the supervisor knows which start is tried again.
 
     Raises:
         LaunchError: it cannot be written.
@@ -178,8 +181,10 @@ def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> str:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         os.close(atomic_file.replace(str(path), base64.b64encode(key)))
     except OSError as error:
+        if error.errno in atomic_file.NO_ROOM:
+            return False
         raise LaunchError(f"the key of {instance} cannot be written: {error.strerror}") from None
-    return str(path)
+    return True
 
 
 def key_path(state_directory: Path, instance: InstanceId) -> Path:

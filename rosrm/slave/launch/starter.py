@@ -125,6 +125,7 @@ class Starter:
     _launching: dict[InstanceId, Assignment] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
     _warned_of: set[str] = field(init=False, default_factory=set)
+    _keyless: set[InstanceId] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
         own = {**os.environ, **self.config.ros.environment()}
@@ -221,6 +222,7 @@ class Starter:
     def ended(self, instance: InstanceId) -> None:
         """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
+        self._keyless.discard(instance)
         with contextlib.suppress(OSError):
             key_path(self.supervisor.state, instance).unlink(missing_ok=True)
         self.replication.ended(instance)
@@ -369,8 +371,20 @@ class Starter:
                     assignment.instance, path,
                 )  # fmt: skip
 
+    def write_missing_keys(self) -> None:
+        """Write the keys for which the disk had no room; called while it has some."""
+        for instance in list(self._keyless):
+            work = partial(self._write_key, instance)
+            self.paths.run(work, lambda _: None, lambda fault: _log.warning("%s", fault))
+
     def _write_key(self, instance: InstanceId) -> str:
-        return write_key(instance, self.instance_key(instance) or b"", self.supervisor.state)
+        """Write the key of an instance, or note that it is missing; called in a thread."""
+        key, state = self.instance_key(instance) or b"", self.supervisor.state
+        if write_key(instance, key, state):
+            self._keyless.discard(instance)
+        else:
+            self._keyless.add(instance)
+        return str(key_path(state, instance))
 
     def _location(self) -> ProcessLocation:
         config = self.config

@@ -29,7 +29,7 @@ from rosrm.model.values import (
 )
 from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
-from rosrm.slave.launch.command import command_in_image, order_of, plain_launch, write_key
+from rosrm.slave.launch.command import command_in_image, key_path, order_of, plain_launch, write_key
 from rosrm.slave.launch.environment import (
     ProcessLocation,
     process_environment,
@@ -576,7 +576,8 @@ def test_each_process_gets_the_key_of_its_instance_in_a_file(tmp_path):
     """
 
     def write(instance):
-        return write_key(instance, KEYED.instance_key(instance), tmp_path)
+        assert write_key(instance, KEYED.instance_key(instance), tmp_path)
+        return str(key_path(tmp_path, instance))
 
     here = replace(KEYED, key_file=write)
     stateful = replace(assignment(command=("x",)), snapshots_from=1)
