@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -37,6 +38,9 @@ ASK_LIMIT: Final = 0.5
 #: Most processes of an instance, and the highest pid of a kernel.
 MOST_MEMBERS: Final = 32_768
 _HIGHEST_PID: Final = 1 << 22
+#: Most bytes of a command line with its environment: half of what a kernel accepts by default. As
+#: JSON they are shorter than the longest line that a supervisor accepts.
+MOST_BYTES: Final = 1 << 20
 
 
 def _no_capabilities(_spec: ProcessSpec) -> Capabilities:
@@ -236,4 +240,8 @@ def _checked(launch: Launch, prepared: Launch) -> Launch:
     odd = next((one for one in added if not one or "=" in one), None)
     if odd is not None:
         raise PluginError(f"`environment` has the name {odd!r:.100}, which no variable can have")
+    words = (*argv, *environment, *environment.values())
+    size = sum(len(os.fsencode(one)) + 1 for one in words)
+    if size > MOST_BYTES:
+        raise PluginError(f"`argv` and `environment` have {size} bytes; allowed: {MOST_BYTES}")
     return replace(launch, argv=argv, environment=environment)

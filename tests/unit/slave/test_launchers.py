@@ -119,6 +119,21 @@ def test_a_launcher_that_cannot_prepare_refuses_the_start(act, said):
         launchers(ours=Odd()).prepare(launch("ours"))
 
 
+@pytest.mark.parametrize("changes", [
+    {"argv": ("x" * 60_000,) * 200},
+    {"environment": {f"V{at}": "\x01" * 60_000 for at in range(200)}},
+])  # fmt: skip
+def test_a_launch_that_no_order_can_hold_refuses_the_start(changes):
+    """The supervisor ends a connection with a longer order, and the next one, too."""
+
+    class Wordy:
+        def prepare(self, launch):
+            return replace(launch, **changes)
+
+    with pytest.raises(LaunchError, match=r"have 12\d{6} bytes; allowed: 1048576"):
+        launchers(ours=Wordy()).prepare(launch("ours"))
+
+
 def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
     """They count to the instance, wherever they are; of other sessions the table finds them."""
     known = launchers(ours=Restorer())
