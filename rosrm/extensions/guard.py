@@ -15,7 +15,7 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.extensions.plugin_calls import Answers, Plugin, contained, titled
 from rosrm.extensions.process_state import Interrupts, ProcessState
-from rosrm.extensions.time_limit import CALL_LIMIT, limited
+from rosrm.extensions.time_limit import CALL_LIMIT, end_limit, limited
 from rosrm.wording import listed
 
 T = TypeVar("T")
@@ -124,6 +124,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
                 raise
             raise PluginError(describe_plugin_fault(fault)) from fault
         finally:
+            end_limit()
             interrupts.end()
             changed = before.restore()
             if changed and logging.getLogger().handlers:  # a command has no log

@@ -58,6 +58,15 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
         raise TimeoutError(late()) from None
 
 
+def end_limit() -> None:
+    """Interrupt the innermost call no more, as it has ended; only in the main thread.
+
+    What restores the process after it calls functions, each of which would be interrupted.
+    """
+    if _Alarm.ringing is not None:
+        _Alarm.ringing.stop()
+
+
 def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T:
     alarm = _Alarm(inspect.currentframe(), clocks.awake_time() + seconds)
     outer, _Alarm.ringing = _Alarm.ringing, alarm

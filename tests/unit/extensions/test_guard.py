@@ -28,6 +28,7 @@ from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import PluginCalls, required
 from rosrm.extensions.plugin_deadline import Deadlines
 from rosrm.extensions.process_state import ProcessState
+from rosrm.runtime.crash_notes import kept_notes
 
 PLUGIN = ("filter", "odd")
 #: Letters of the longest text that any message of rosrm accepts, many times over.
@@ -312,6 +313,31 @@ def test_the_limit_holds_although_a_plugin_takes_its_signal(hang: Callable[[], N
     with pytest.raises(PluginError, match="took longer than"):
         guarded(hang, whom="filter 'odd'", seconds=0.2)
     assert time.monotonic() - began < 20.0
+
+
+@pytest.mark.usefixtures("_own_timer")
+def test_what_a_plugin_that_catches_its_interrupts_has_changed_is_restored(tmp_path: Path) -> None:
+    """The interrupts end before the process is restored and the note of the call is removed."""
+
+    def stubborn() -> None:
+        signal.signal(signal.SIGTERM, _ignore)
+        os.umask(0)
+        until = time.monotonic() + 0.2
+        while time.monotonic() < until:
+            try:
+                while time.monotonic() < until:
+                    pass
+            except BaseException:  # noqa: BLE001 - such plugins exist
+                pass
+
+    before = _state()
+    with kept_notes(tmp_path):
+        for _ in range(3):
+            with pytest.raises(PluginError, match="took longer than"):
+                guarded(stubborn, whom="filter 'odd'", hook="mask", seconds=0.01)
+            assert _state() == before
+        (notes,) = tmp_path.glob("plugin-calls.*")
+        assert b"filter" not in notes.read_bytes()
 
 
 def test_a_plugin_that_is_often_slow_is_not_called_for_a_while() -> None:
