@@ -54,15 +54,18 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
     )  # fmt: skip
     limits = [f"{name}={value}" for name, value in zip(names, log, strict=True)]
     command = [sys.executable, "-I", "-S", str(main), "--state", str(state), *limits]
-    with oom_score.score_of_children():  # it protects itself
-        process = subprocess.Popen(
-            command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            umask=private_files.user_umask(),  # its processes inherit it
-        )
+    try:
+        with oom_score.score_of_children():  # it protects itself
+            process = subprocess.Popen(
+                command,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                umask=private_files.user_umask(),  # its processes inherit it
+            )
+    except OSError as error:  # most likely where the former one has ended for lack of memory
+        return f"its process cannot be started: {error.strerror}"
     assert process.stdout is not None
     with process.stdout as output:
         answer = b""

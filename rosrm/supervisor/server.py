@@ -130,7 +130,7 @@ class Server:
         """
         self._watch(self._listener, self._accept)
         self._watch_signals()
-        _guarded(self._take_over)
+        self._take_over()  # unguarded: what a half of it left out would be started a second time
         while True:
             _guarded(self._round)
             if self._leaving:

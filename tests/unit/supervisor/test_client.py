@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import socket
+import subprocess
 import time
 from pathlib import Path
 
 import pytest
 
 from rosrm.core.supervisor.events import ContactReported
+from rosrm.errors import SupervisorError
 from rosrm.supervisor import endpoint, messages
 from rosrm.supervisor.client import (
     SupervisorClient,
@@ -50,3 +53,14 @@ def test_a_connection_closed_by_another_thread_is_gone(tmp_path: Path) -> None:
         client.close()
         with pytest.raises(SupervisorGone):
             client.receive(5.0)
+
+
+def test_a_supervisor_that_cannot_be_forked_is_an_error_with_a_reason(tmp_path, monkeypatch):
+    """Any other exception would end the thread that replaces it, and the slave would hang."""
+
+    def fail(*_, **__):
+        raise OSError(errno.EAGAIN, "Resource temporarily unavailable")
+
+    monkeypatch.setattr(subprocess, "Popen", fail)
+    with pytest.raises(SupervisorError, match=r"did not start: .* temporarily unavailable"):
+        SupervisorClient.connect(tmp_path / "state")

@@ -19,7 +19,7 @@ from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 from rosrm.model.durations import LONGEST_STOP
-from rosrm.supervisor import endpoint, instance_record, messages, procfs, spawn
+from rosrm.supervisor import endpoint, instance_record, messages, procfs, spawn, takeover
 from rosrm.supervisor.json_lines import ProtocolError, line
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.server import LONGEST_WAIT, Server
@@ -316,3 +316,17 @@ def test_a_connection_without_a_free_descriptor_is_closed(server, tmp_path, monk
     assert peer.recv(1) == b""
     assert os.fstat(its._null)
     peer.close()
+
+
+def test_a_take_over_that_fails_serves_nobody(server, monkeypatch):
+    """To a slave, the instances that it left out would be lost; another supervisor tries again."""
+
+    def fail(*_):
+        raise OSError(errno.ENFILE, "Too many open files in system")
+
+    it = server()
+    monkeypatch.setattr(takeover, "restore", fail)
+    monkeypatch.setattr(it, "_watch_signals", lambda: None)
+    monkeypatch.setattr(it, "_round", lambda: pytest.fail("it serves"))
+    with pytest.raises(OSError, match="in system"):
+        it.run()
