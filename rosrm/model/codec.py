@@ -181,7 +181,11 @@ def checked(value: T, what: str) -> T:
             raise PluginError(
                 f"an unsound {what}: {len(text)} bytes as JSON; allowed: {LONGEST_OF_PLUGIN}"
             )
-        return from_plain(type(value), json.loads(text))
+        plain = json.loads(text)
+        json.dumps(plain, ensure_ascii=False).encode()  # as messages hold it
+        return from_plain(type(value), plain)
+    except UnicodeEncodeError:
+        raise PluginError(f"an unsound {what}: it has a character that UTF-8 cannot hold") from None
     except (ValueError, TypeError) as fault:
         raise PluginError(f"an unsound {what}: {fault}") from fault
 

@@ -623,6 +623,19 @@ def test_a_move_has_the_options_of_its_process() -> None:
     assert len(cluster.recorded("plugin_failed")) == 1
 
 
+def test_a_plan_with_a_text_that_no_message_can_hold_is_unsound() -> None:
+    """An order with half of a character could never be sent, also after a start of the master."""
+
+    def odd(move: Move) -> Plan:
+        there = move.destination, move.destination_host, 5.0
+        return Plan((Start(*there, remappings={"a": "\ud800"}), AwaitReady(*there), Commit()))
+
+    cluster = moving_by(odd)
+    reply = cluster.migrate("p")
+    assert not reply.accepted
+    assert "an unsound plan: it has a character that UTF-8 cannot hold" in reply.message
+
+
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
     """Started instances that do not own the name are stopped before anything else is started."""
 
