@@ -149,7 +149,11 @@ class PathCalls:
             self._post(partial(call.failed, fault))
             return
         if self._lane is None:
-            self._lane = _Lane(self._name, self._clock, self._finish)
+            try:
+                self._lane = _Lane(self._name, self._clock, self._finish)
+            except RuntimeError as error:  # no thread can be started
+                self._post(partial(call.failed, error))
+                return
         self._lane.calls.put(call)
 
     def _late_calls(self) -> list[_Call]:

@@ -38,12 +38,16 @@ class Worker:
                 outcome = partial(failed, error)
             self._post(outcome)
 
-        self._started().put(job)
+        try:
+            self._started().put(job)
+        except RuntimeError as error:  # no thread can be started
+            self._post(partial(failed, error))
 
     def _started(self) -> queue.SimpleQueue[Callable[[], None]]:
         if self._jobs is None:
-            self._jobs = queue.SimpleQueue()
-            threading.Thread(target=_work, args=(self._jobs,), name=self._name, daemon=True).start()
+            jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
+            threading.Thread(target=_work, args=(jobs,), name=self._name, daemon=True).start()
+            self._jobs = jobs
         return self._jobs
 
 

@@ -263,9 +263,12 @@ class Starter:
             self._report(orders.current)
 
         def held_up(error: Exception) -> None:
-            take()
-            if orders.current is not None:
-                self._send([(orders.current, LaunchError(str(error)))], slots)
+            if orders.current is None:  # no thread could begin: another try would fail as well
+                refused = orders.take()[1]
+            else:
+                take()
+                refused = [orders.current]
+            self._send([(one, LaunchError(str(error))) for one in refused], slots)
 
         self.paths.run(orders.make, lambda _: take(), held_up, late=late)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import queue
+import threading
 import time
 from types import SimpleNamespace
 
@@ -22,6 +23,7 @@ from rosrm.model.values import (
     ProcessSpec,
 )
 from rosrm.runtime.path_calls import PathCalls
+from rosrm.runtime.worker import Worker
 from rosrm.slave.launch.command import key_path
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
@@ -158,3 +160,35 @@ def test_a_key_that_finds_no_room_is_written_later(slave, tmp_path):
         disk.make_room()
         slave.starter.write_missing_keys()
         slave.wait(key_path(state, one).exists)
+
+
+def test_a_start_for_which_no_thread_is_left_is_refused(slave, monkeypatch):
+    """It waited for ever, or was tried again without a pause."""
+    with monkeypatch.context() as without:
+        without.setattr("rosrm.runtime.path_calls.MOST_LATE", 0)
+        slave.launch(ProcessSpec("late", command=("true",)))
+        slave.wait(lambda: "late" in slave.refused)
+    with monkeypatch.context() as without:
+        without.setattr(threading.Thread, "start", no_thread)
+        slave.launch(ProcessSpec("none", command=("true",)))
+        slave.wait(lambda: "none" in slave.refused)
+    slave.launch(ProcessSpec("next", command=("true",)))
+    slave.wait(lambda: slave.started == ["next"])
+
+
+def test_a_file_operation_without_a_thread_fails(monkeypatch):
+    """Later ones get their thread, and do not wait behind it."""
+    posted: queue.Queue = queue.Queue()
+    worker, seen = Worker("test", posted.put), []
+    with monkeypatch.context() as without:
+        without.setattr(threading.Thread, "start", no_thread)
+        worker.run(lambda: 1, seen.append, lambda error: seen.append(str(error)))
+    posted.get(timeout=PATIENCE)()
+    worker.run(lambda: 2, seen.append, lambda error: seen.append(str(error)))
+    posted.get(timeout=PATIENCE)()
+    assert seen == ["can't start new thread", 2]
+
+
+def no_thread(_) -> None:
+    """Fail as where the limit of the processes is reached."""
+    raise RuntimeError("can't start new thread")
