@@ -116,7 +116,9 @@ def _fraction(value: float) -> str:
         return ".nan"
     if math.isinf(value):
         return ".inf" if value > 0 else "-.inf"
-    return repr(value)
+    text = repr(value)
+    # YAML reads an exponent without a point, as in 1e-05, as a text.
+    return text if "." in text else text.replace("e", ".0e")
 
 
 def _text(value: str) -> str:

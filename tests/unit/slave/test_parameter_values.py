@@ -19,6 +19,7 @@ VALUES = SCALARS | st.lists(SCALARS, max_size=3) | st.just([[1]])
 @example(name="a", value=[])
 @example(name="a", value="x\0y")
 @example(name="", value=1)
+@example(name="a", value=1e-05)
 def test_every_value_that_is_accepted_reaches_a_node(name, value):
     """In the file of a process, and in the request for a component."""
     if parameter_fault(name, value):
