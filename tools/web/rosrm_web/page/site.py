@@ -68,7 +68,11 @@ def mount(app: FastAPI, gateway: Gateway, access: Access) -> None:
     """Add the page to the application of the gateway, at `/`."""
     live, feed = Live(gateway), Feed(gateway)
     nicegui_app.config.socket_io_js_transports = ["websocket"]  # polling would send POST requests
-    room = [Depends(partial(_check_room, live, access))]
+
+    async def check_room(request: Request) -> None:  # FastAPI resolves no annotations of a partial
+        _check_room(live, access, request)
+
+    room = [Depends(check_room)]
     page = ui.page("/", title="rosrm", dark=None, reconnect_timeout=_ABSENCE, dependencies=room)
     page(partial(_page, gateway, access, live, feed))
     ui.run_with(
@@ -83,7 +87,7 @@ def _quickly(app: ASGIApp) -> GZipMiddleware:
     return GZipMiddleware(app, compresslevel=1)
 
 
-async def _check_room(live: Live, access: Access, request: Request) -> None:
+def _check_room(live: Live, access: Access, request: Request) -> None:
     """Refuse one more page; raises `Busy`."""
     access.check_room(request.scope["user"])
     if len(live.on_change) >= MOST_PAGES:
