@@ -138,10 +138,11 @@ def begin(
         OSError: the control group is gone, or the system has no room, see `TRANSIENT`.
     """
     report, told = os.pipe2(os.O_CLOEXEC)
+    parent = os.getpid()
     try:
         pid, inside = _fork(group)
         if not pid:
-            _become(program, (null, log, told), -1 if inside else group, scheduler)
+            _become(program, (null, log, told), -1 if inside else group, scheduler, parent)
     except BaseException:
         os.close(report)
         raise
@@ -169,8 +170,9 @@ def _fork(group: int) -> tuple[int, bool]:
 
 
 def _become(
-    program: Program, files: tuple[int, int, int], group: int, scheduler: Scheduler | None
-) -> NoReturn:
+    program: Program, files: tuple[int, int, int], group: int, scheduler: Scheduler | None,
+    parent: int,
+) -> NoReturn:  # fmt: skip
     """Turn the child into the program, or report why that is impossible."""
     null, log, told = files
 
@@ -190,7 +192,7 @@ def _become(
         told = _REPORT
         # A child that waits for a path must not hold the lock and the socket of its supervisor.
         os.closerange(_REPORT + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
-        _execute(program, tell, scheduler)
+        _execute(program, tell, scheduler, parent)
     except SpawnError as error:
         kind = _NO_SCHEDULE if isinstance(error, ScheduleRefused) else _FAULT
         tell(_TRANSIENT_FAULT if error.transient else kind, str(error))
@@ -219,7 +221,7 @@ def _enter_group(group: int, tell: Callable[[str, str], None]) -> bool:
 
 
 def _execute(
-    program: Program, tell: Callable[[str, str], None], scheduler: Scheduler | None
+    program: Program, tell: Callable[[str, str], None], scheduler: Scheduler | None, parent: int
 ) -> NoReturn:
     environment, directory = dict(program.environment), program.directory
     tell(_STEP, f"the working directory {directory!r}")
@@ -240,6 +242,8 @@ def _execute(
             os.sched_setscheduler(0, *scheduler)
         except PermissionError:
             raise ScheduleRefused(f"{path} may not have real-time scheduling here") from None
+    if os.getppid() != parent:
+        os._exit(127)  # the next supervisor did not find its marks, and may start another one
     try:
         os.execve(path, program.argv, environment)  # noqa: S606 - no shell is wanted
     except OSError as error:

@@ -107,3 +107,13 @@ def test_a_program_on_a_mount_without_exec_is_said(tmp_path):
         program.chmod(0o755)
         with pytest.raises(SpawnError, match="mounted with noexec"):
             executed(begin(Program((str(program),), {}, "/"), 0, 1))
+
+
+def test_a_start_ends_with_its_supervisor(tmp_path, monkeypatch):
+    """The next supervisor does not find it before its exec, and may start the same once more."""
+    null = os.open(os.devnull, os.O_RDWR)
+    monkeypatch.setattr(os, "getppid", lambda: 1)  # of the child, whose parent is gone
+    pid = executed(begin(Program(("touch", "ran"), dict(os.environ), str(tmp_path)), null, null))
+    os.close(null)
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 127
+    assert not (tmp_path / "ran").exists()
