@@ -17,8 +17,9 @@ from tests.waiting import wait_gone, wait_until
 #: A leader that ends at a signal, and leaves a child that ignores SIGINT.
 LEAVES = """
 (trap '' INT; exec sleep 1000) &
-echo $! > child
+child=$!
 trap 'exit 5' USR1
+echo $child > child
 while :; do sleep 0.01; done
 """
 #: A program that ends with a code at a signal.
