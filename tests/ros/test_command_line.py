@@ -351,7 +351,8 @@ def test_top_can_be_stopped_and_continued(rosrm) -> None:
     rosrm.run("status")  # a master can be found in time now
     script = (
         f"set -m; {sys.executable} -m rosrm.cli top --period 60s; "
-        "echo STOPPED $(stty -a | grep -o -e '-\\?echo\\b'); fg; echo ENDED $?"
+        "echo STOPPED $(stty -a | grep -o -e '-\\?echo\\b'); "
+        "read; fg; echo ENDED $?"
     )
     screen, inside = os.openpty()
     with subprocess.Popen(
@@ -364,6 +365,7 @@ def test_top_can_be_stopped_and_continued(rosrm) -> None:
             read_until(screen, "q quits")
             os.write(screen, b"\x1a")
             read_until(screen, "STOPPED echo\r\n")
+            os.write(screen, b"\n")  # the screen that follows is not part of the same read
             read_until(screen, "q quits")
             os.write(screen, b"m")
             read_until(screen, "q quits")

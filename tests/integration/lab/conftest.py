@@ -42,8 +42,8 @@ def lab_is_possible():
 
 
 #: Marks of the mounts that other labs and tests make and remove at any time. pyroute2, like `ip`,
-#: makes /run/netns a mount point with the first namespace, permanently.
-_OF_OTHERS = frozenset({"rosrm-lab", "/run/netns", "/pytest-of-"})
+#: makes /run/netns a mount point with the first namespace, permanently; CRIU checks the kernel.
+_OF_OTHERS = frozenset({"rosrm-lab", "/run/netns", "/pytest-of-", "criu.move_mount_set_group"})
 
 
 def remains(lab: str) -> dict[str, set[str]]:

@@ -22,7 +22,7 @@ MOST_OF_USER: Final = 32
 class Sessions:
     """Sessions of this run of the gateway; another gateway, or the next run, knows none of them.
 
-    A session ends with the token of its user, because then `access` has that user no more.
+    A session ends with the token of its user. As with the token, the role is that of the file.
 
     Args:
         access: has the users whose tokens are valid.
@@ -32,28 +32,29 @@ class Sessions:
     def __init__(self, access: Access, clock: Callable[[], float] = clocks.boot_time) -> None:
         self._access = access
         self._clock = clock
-        #: Digest of each id to its user and end; the ids are not kept.
-        self._known: dict[bytes, tuple[User, float]] = {}
+        #: Digest of each id to that of the token and the end; neither id nor token is kept.
+        self._known: dict[bytes, tuple[bytes, float]] = {}
 
     def begin(self, user: User) -> str:
         """Return the id of a new session."""
         self._known = {
-            key: known for key, known in self._known.items() if self._is_valid(*known)
+            key: known for key, known in self._known.items() if self._user(*known)
         }  # fmt: skip
-        own = [key for key, (known, _) in self._known.items() if known == user]
+        own = [key for key, (token, _) in self._known.items() if token == user.digest]
         for key in own[: max(0, len(own) + 1 - MOST_OF_USER)]:
             del self._known[key]
         number = secrets.token_urlsafe(32)
-        self._known[_digest(number)] = user, self._clock() + LIFETIME
+        self._known[_digest(number)] = user.digest, self._clock() + LIFETIME
         return number
 
     def user_of(self, number: str) -> User | None:
         """Return the user of a session; None: there is none, or it has ended."""
         known = self._known.get(_digest(number))
-        return known[0] if known is not None and self._is_valid(*known) else None
+        return self._user(*known) if known is not None else None
 
-    def _is_valid(self, user: User, end: float) -> bool:
-        return self._clock() < end and user in self._access.users
+    def _user(self, token: bytes, end: float) -> User | None:
+        users = self._access.users if self._clock() < end else ()
+        return next((user for user in users if user.digest == token), None)
 
 
 def cookie_name(*, is_secure: bool, port: int) -> str:
