@@ -14,7 +14,7 @@ from rosrm.model.arrays import NO_ARRAY
 from rosrm.model.artifacts import Artifact
 from rosrm.model.component_rules import components_fault
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
-from rosrm.model.durations import LONGEST
+from rosrm.model.durations import LONGEST, LONGEST_STOP
 from rosrm.model.lifecycle_rules import lifecycle_fault
 from rosrm.model.limits import LARGEST_CPU_NUMBER, LEAST_CPU, LEAST_MEMORY
 from rosrm.model.schedules import NO_SCHEDULE, WEEKDAYS, Schedule
@@ -128,10 +128,10 @@ _BY_NAME: Final[Mapping[str, Drawn]] = {
     "rate": st.floats(0.0, 1e6),
     **{
         name: st.floats(0.0, LONGEST)
-        for name in (
-            "delay", "max_delay", "window", "timeout", "interrupt_grace", "terminate_grace",
-            "after", "grace",
-        )
+        for name in ("delay", "max_delay", "window", "timeout", "after", "grace")
+    },
+    **{
+        name: st.floats(0.0, LONGEST_STOP / 2) for name in ("interrupt_grace", "terminate_grace")
     },
 }  # fmt: skip
 

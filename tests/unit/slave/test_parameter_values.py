@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -20,6 +22,7 @@ VALUES = SCALARS | st.lists(SCALARS, max_size=3) | st.just([[1]])
 @example(name="a", value="x\0y")
 @example(name="", value=1)
 @example(name="a", value=1e-05)
+@example(name="a", value=[0])
 def test_every_value_that_is_accepted_reaches_a_node(name, value):
     """In the file of a process, and in the request for a component."""
     if parameter_fault(name, value):
@@ -27,4 +30,5 @@ def test_every_value_that_is_accepted_reaches_a_node(name, value):
     read = yaml.safe_load(parameters_text({"/**": {name: value}}))
     assert read == {"/**": {"ros__parameters": {name: value}}}
     message = Parameter(name, value=value).to_parameter_msg()
-    assert Parameter.from_parameter_msg(message).value == value
+    reached = Parameter.from_parameter_msg(message).value
+    assert (list(reached) if isinstance(reached, array) else reached) == value
