@@ -98,7 +98,8 @@ def test_a_second_collector_on_one_directory_is_refused(cluster) -> None:
     archive = cluster.directory / "archive"
     with collector(cluster, archive) as first:
         lock = archive / "collector.lock"
-        wait_until(lambda: lock.exists() and lock.read_text() == str(first.pid), "the lock")
+        mark = [str(first.pid)]
+        wait_until(lambda: lock.exists() and lock.read_text().split() == mark, "the lock")
         with collector(cluster, archive) as second:
             assert second.wait(PATIENCE) == 1
         first.send_signal(signal.SIGTERM)
