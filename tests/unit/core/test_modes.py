@@ -203,8 +203,8 @@ def test_a_mode_whose_process_finds_no_room_for_long_is_left_again() -> None:
     assert "docked is not reached, and exploring returns: charger finds no host: " in failed
 
 
-def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
-    """The new mode stops a process, whose room ends the wait of another one."""
+def with_a_waiting_process() -> Cluster:
+    """Return a cluster in a mode of which a process has waited long for the room of another one."""
     waiting = target("nav", process("planner", 8_000, host_loss=HostLossPolicy("elsewhere")))
     large = target("map", process("mapper", 8_000))
     cluster = in_mode(
@@ -213,6 +213,12 @@ def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
     )  # fmt: skip
     cluster.cut(*cluster.where("planner"))
     cluster.wait(60.0)
+    return cluster
+
+
+def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
+    """The new mode stops a process, whose room ends the wait of another one."""
+    cluster = with_a_waiting_process()
     assert cluster.phase("planner") == "queued"
     (host,) = cluster.where("mapper")
     cluster.machines[host].stubborn.add("mapper")
@@ -224,14 +230,7 @@ def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
 
 def test_a_clock_that_is_set_ends_no_switch() -> None:
     """A restarted master counts the wait of a process by its own time, not by unix time."""
-    waiting = target("nav", process("planner", 8_000, host_loss=HostLossPolicy("elsewhere")))
-    large = target("map", process("mapper", 8_000))
-    cluster = in_mode(
-        "exploring", Mode("exploring", (waiting, large)), Mode("docked", (waiting,)),
-        cluster=Cluster("a", "b", progress_deadline=20.0),
-    )  # fmt: skip
-    cluster.cut(*cluster.where("planner"))
-    cluster.wait(60.0)
+    cluster = with_a_waiting_process()
     (host,) = cluster.where("mapper")
     cluster.machines[host].stubborn.add("mapper")
     assert switch(cluster, "docked").accepted
