@@ -7,8 +7,9 @@ selected  a call raises, is late, or answers in       `failing`; a record
           breach of the contract
 failing   a call fails with another error             a record, at most one in
                                                       `RECORD_PERIOD` seconds
-failing   a call has succeeded since the last         `selected`; a record
-          failure, `WORKS_AFTER` seconds ago
+failing   each method that failed has succeeded       `selected`; a record
+          since, the last failure was `WORKS_AFTER`
+          seconds ago
 ========  ==========================================  =====================================
 """
 
@@ -60,20 +61,19 @@ class Failing:
         error: last failure: the hook, the exception and its place.
         count: number of failures since the plugin worked last.
         last: time of the last failure.
-        succeeded: True if a call has succeeded since.
+        hooks: methods that have not succeeded since their last failure.
     """
 
     error: str = ""
     count: int = 0
     last: float = -inf
-    succeeded: bool = False
+    hooks: set[str] = field(default_factory=set)
     _recorded: str = ""
     _recorded_at: float = -inf
 
     def note(self, error: str, count: int, now: float) -> bool:
         """Note the newest error; return True if it must be recorded."""
         self.error, self.count, self.last = error, self.count + count, now
-        self.succeeded = False
         if error == self._recorded or now - self._recorded_at < RECORD_PERIOD:
             return False
         self._recorded, self._recorded_at = error, now
@@ -81,7 +81,7 @@ class Failing:
 
     def reason(self, now: float) -> str:
         """Return the last error, its age and the number of failures, for a listing."""
-        since = "; it has succeeded since" if self.succeeded else ""
+        since = "" if self.hooks else "; it has succeeded since"
         age = duration(now - self.last)
         return f"{self.error}; {counted(self.count, 'failure')} so far, the last {age} ago{since}"
 
@@ -102,7 +102,7 @@ class PluginCalls:
     limit: Limit = _without_limit
     failing: dict[Plugin, Failing] = field(default_factory=dict)
     _failed: dict[Plugin, Failing] = field(default_factory=dict)
-    _worked: set[Plugin] = field(default_factory=set)
+    _worked: set[tuple[Plugin, str]] = field(default_factory=set)
     _running: Plugin | None = None
 
     def ask(
@@ -136,20 +136,25 @@ class PluginCalls:
             if isinstance(fault, lets):
                 raise
             reason = describe_plugin_fault(fault)
-            self.note(plugin, f"{hook}: {reason}")
+            self.note(plugin, hook, f"{hook}: {reason}")
             raise PluginError(reason) from fault
         finally:
             self._running = outer
-        self.note(plugin, "")
+        self.note(plugin, hook)
         return answer
 
-    def note(self, plugin: Plugin, error: str) -> None:
-        """Note the error of a call; "": it succeeded. May be called from any thread."""
+    def note(self, plugin: Plugin, hook: str, error: str = "") -> None:
+        """Note the error of a call; "": it succeeded. May be called from any thread.
+
+        Args:
+            hook: the called method; "": it is not known, and the success of any other replaces it.
+        """
         if error:
             noted = self._failed.setdefault(plugin, Failing())
             noted.error, noted.count = error, noted.count + 1
+            noted.hooks.add(hook)
         elif plugin in self.failing:
-            self._worked.add(plugin)
+            self._worked.add((plugin, hook))
 
     def changes(self, now: float) -> list[tuple[Plugin, str]]:
         """Return the plugins that began to fail, or to work (""), since the last call."""
@@ -158,14 +163,16 @@ class PluginCalls:
         found: list[tuple[Plugin, str]] = []
         failed, self._failed = self._failed, {}
         worked, self._worked = self._worked, set()
-        for plugin, noted in list(failed.items()):  # a thread may still note an error
-            if self.failing.setdefault(plugin, Failing()).note(noted.error, noted.count, now):
-                found.append((plugin, noted.error))
-        for plugin in worked - failed.keys():
+        for plugin, hook in worked:
             if known := self.failing.get(plugin):  # a thread may note this after the end
-                known.succeeded = True
+                known.hooks -= {hook, ""}
+        for plugin, noted in list(failed.items()):  # a thread may still note an error
+            known = self.failing.setdefault(plugin, Failing())
+            known.hooks |= noted.hooks
+            if known.note(noted.error, noted.count, now):
+                found.append((plugin, noted.error))
         for plugin, known in sorted(self.failing.items()):
-            if known.succeeded and now - known.last >= WORKS_AFTER:
+            if not known.hooks and now - known.last >= WORKS_AFTER:
                 del self.failing[plugin]
                 found.append((plugin, ""))
         return found

@@ -148,7 +148,7 @@ class Registry:
         for crash in crashes:
             _log.warning("%s: %s", crash.whom, crash.text)
             if crash.whom in known:
-                self.calls.note(known[crash.whom], crash.text)
+                self.calls.note(known[crash.whom], "", crash.text)
 
     # --- offers -------------------------------------------------------------------------------
 

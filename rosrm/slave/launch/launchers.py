@@ -145,7 +145,7 @@ class Launchers:
                 of=launcher, lets=(LaunchError, RosrmError, ValueError),
             )  # fmt: skip
         except PluginError as fault:
-            self.calls.note(("launcher", name), f"prepare: {fault}")
+            self.calls.note(("launcher", name), "prepare", f"prepare: {fault}")
             raise PluginError(f"the launcher {name!r} fails: prepare: {fault}") from None
         except LaunchError:
             raise
@@ -154,7 +154,7 @@ class Launchers:
         finally:
             self._since.pop(name, None)
             lock.release()
-        self.calls.note(("launcher", name), "")
+        self.calls.note(("launcher", name), "prepare")
         return prepared
 
     def discard_images(self, instance: InstanceId) -> None:

@@ -252,13 +252,33 @@ def test_an_answer_that_arrives_while_the_failure_ends_leaves_no_trace() -> None
             calls.changes(100.0)
             return known
 
-    calls.note(plugin, "no")
+    calls.note(plugin, "prepare", "no")
     calls.changes(0.0)
-    calls.note(plugin, "")
+    calls.note(plugin, "prepare")
     calls.changes(1.0)
     known, calls.failing = calls.failing, Crossed(calls.failing)
-    calls.note(plugin, "")
+    calls.note(plugin, "prepare")
     calls.failing = dict(calls.failing)
     assert plugin in known
-    calls.note(("launcher", "other"), "no")
+    calls.note(("launcher", "other"), "prepare", "no")
     assert calls.changes(101.0) == [(("launcher", "other"), "no")]
+
+
+def test_a_plugin_fails_until_the_method_that_failed_succeeds() -> None:
+    """Otherwise a policy with one broken method would be said to work by its other methods."""
+    calls, plugin = PluginCalls(), ("scoring", "x")
+    calls.note(plugin, "score", "score: no")
+    calls.changes(0.0)
+    calls.note(plugin, "rank")
+    assert calls.changes(WORKS_AFTER) == []
+    calls.note(plugin, "score")
+    assert calls.changes(WORKS_AFTER) == [(plugin, "")]
+
+
+def test_any_success_ends_the_failure_of_a_call_that_is_not_known() -> None:
+    """A former process ended in it."""
+    calls, plugin = PluginCalls(), ("scoring", "x")
+    calls.note(plugin, "", "the process has ended in a call of it")
+    calls.changes(0.0)
+    calls.note(plugin, "score")
+    assert calls.changes(WORKS_AFTER) == [(plugin, "")]
