@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import signal
 import time
 from collections.abc import Iterable, Sequence
 from itertools import islice
@@ -151,6 +152,23 @@ def sanitized(text: str, most: int = 4096, *, lines: bool = False) -> str:
         one if one.isprintable() or (lines and one == "\n") else " " if one.isspace() else "?"
         for one in cut
     )
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal: "SIGTERM" for 15, "signal 35" for a real-time signal."""
+    try:
+        return signal.Signals(number).name  # noqa: TID251 - the one place
+    except ValueError:
+        return f"signal {number}"
+
+
+def ending_of(code: int) -> str:
+    """Return how a program has ended: "exit code 3", "killed by SIGTERM".
+
+    Args:
+        code: its return code; a signal as a negative number.
+    """
+    return f"exit code {code}" if code >= 0 else f"killed by {signal_name(-code)}"
 
 
 def words(name: str) -> str:

@@ -10,7 +10,7 @@ import json
 import os
 import socket
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,8 +22,6 @@ _LONGEST: Final = 1 << 20
 FAULT: Final = "rosrm.component: "
 #: Exit code after such a line.
 FAILED: Final = 1
-#: Most bytes of that line that are read.
-_TAIL: Final = 4096
 #: Name that the kernel shows for the process of a loaded component (at most 15 characters).
 _TITLE: Final = "node in "
 _CREDENTIALS: Final = struct.Struct("3i")
@@ -81,13 +79,7 @@ def container_of(pid: int, proc: str = "/proc") -> int | None:
     return int(number) if number != name and number.isdecimal() else None
 
 
-def fault_in(log: Path) -> str:
-    """Return why a component's process has failed, from the end of its log; "": not known."""
-    try:
-        with log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _TAIL))
-            lines = file.read(_TAIL).decode(errors="replace").splitlines()
-    except OSError:
-        return ""
+def fault_in(lines: Sequence[str]) -> str:
+    """Return why a component's process has failed, from its last log lines; "": not known."""
     last = lines[-1] if lines else ""
     return last.removeprefix(FAULT) if last.startswith(FAULT) else ""

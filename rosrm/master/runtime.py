@@ -6,7 +6,6 @@ import contextlib
 import json
 import logging
 import os
-import signal
 import socket
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -65,7 +64,7 @@ from rosrm.runtime.bootstrap import end_start, handle_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.runtime.worker import Worker
 from rosrm.version import __version__
-from rosrm.wording import counted, listed, one_line
+from rosrm.wording import counted, listed, one_line, signal_name
 
 _log = logging.getLogger("rosrm.master")
 
@@ -374,7 +373,7 @@ class MasterRuntime:
         )
 
     def _stop(self, number: int, _frame: Any) -> None:
-        self._stopping = self._stopping or signal.Signals(number).name
+        self._stopping = self._stopping or signal_name(number)
 
     def _tick(self, now: float) -> None:
         self._endpoint.events += self._reload.poll()

@@ -20,6 +20,7 @@ from rclpy.node import Node
 from rosrm import clocks
 from rosrm.component import link
 from rosrm.node.identity import made_for
+from rosrm.runtime.signalling import send
 
 #: Makes a node by the name of its component and its command line; raises what the component raises.
 Make = Callable[[str, Sequence[str]], Node]
@@ -110,7 +111,7 @@ class ComponentLinks:
             if killed_at is None and _is_gone(connection):
                 killed_at = clocks.boot_time()
             if killed_at is not None and clocks.boot_time() - killed_at > _PATIENCE:
-                os.kill(os.getpid(), signal.SIGKILL)
+                send(os.getpid(), signal.SIGKILL)
 
     def _destroy(self, node: Node) -> None:
         """Destroy a node; its error must not end the executor, which serves the other nodes."""

@@ -28,7 +28,7 @@ def signals_deferred() -> Iterator[None]:
         yield
         return
     arrived: dict[int, FrameType | None] = {}
-    handlers = {one: handler for one in _ENDING if callable(handler := signal.getsignal(one))}
+    handlers = {int(one): handler for one in _ENDING if callable(handler := signal.getsignal(one))}
     for number in handlers:
         signal.signal(number, arrived.__setitem__)
     try:
@@ -38,4 +38,4 @@ def signals_deferred() -> Iterator[None]:
             signal.signal(number, handler)
         with ExitStack() as calls:  # each handler is called, also if another one raises
             for arrival, frame in reversed(arrived.items()):
-                calls.callback(handlers[signal.Signals(arrival)], arrival, frame)
+                calls.callback(handlers[arrival], arrival, frame)

@@ -13,6 +13,8 @@ parent_death.py    end of a process with its parent
 oom_score.py       protection of an agent from the OOM killer
 timer_slack.py     exact ends of the waits of a process
 dispositions.py    handlers of signals that the starter does not ignore
+signalling.py      signals to other processes, which may have ended
+log_tail.py        last lines of a log, for error texts
 memory_file.py     files without a place on a disk
 crash_notes.py     notes of the running calls of plugins, for the next start
 path_calls.py      threads for calls on paths that users name

@@ -7,6 +7,8 @@ import os
 import signal
 from typing import Final
 
+from rosrm.runtime.signalling import send
+
 #: Constant of linux/prctl.h.
 _PR_SET_PDEATHSIG: Final = 1
 
@@ -24,4 +26,4 @@ def end_with_parent(parent: int) -> None:
     if libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0):
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_PDEATHSIG)")
     if os.getppid() != parent:
-        os.kill(os.getpid(), signal.SIGTERM)
+        send(os.getpid(), signal.SIGTERM)

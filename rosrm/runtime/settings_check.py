@@ -15,6 +15,7 @@ from typing import IO, Any, Final, Generic, TypeVar
 from rosrm import clocks
 from rosrm.model.orders import CHECK_TIMEOUT
 from rosrm.runtime.memory_file import memory_file
+from rosrm.wording import ending_of
 
 Config = TypeVar("Config")
 
@@ -106,7 +107,7 @@ class SettingsCheck(Generic[Config]):
         self._process = None
         if code is None:
             errors = f"the check of {self._source.path} took more than {CHECK_TIMEOUT - 1.0:g} s"
-        fault = "" if code == 0 else errors or f"the check ended with exit code {code}"
+        fault = "" if code == 0 else errors or f"the check: {ending_of(code or 0)}"
         self._tell("" if fault else settings, fault)
 
     def _tell(self, text: str, fault: str) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import signal
 import socket
 import sys
 from array import array
@@ -84,7 +83,7 @@ from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.textfile import HostMetrics, Textfile
 from rosrm.slave.usage import UsageWatch
 from rosrm.version import __version__
-from rosrm.wording import by_reason, counted, reload_summary
+from rosrm.wording import by_reason, counted, reload_summary, signal_name
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -424,7 +423,7 @@ class SlaveRuntime:
     def _stop(self, number: int, _frame: Any) -> None:
         if self._stopping:  # the handler may interrupt a log call: the loop logs instead
             self._from_threads.append(lambda: self._ending.log_progress())  # noqa: PLW0108 - as above
-        self._stopping = self._stopping or signal.Signals(number).name
+        self._stopping = self._stopping or signal_name(number)
 
     # --- reload --------------------------------------------------------------------------
 

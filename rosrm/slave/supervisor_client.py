@@ -20,6 +20,7 @@ from rosrm.core.slave import commands, events
 from rosrm.core.supervisor import events as orders
 from rosrm.errors import SupervisorError, assert_never
 from rosrm.model.values import Amendment, InstanceId, InstanceState, InstanceStatus
+from rosrm.runtime.log_tail import last_lines
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.environment import SHADOW
 from rosrm.slave.memos import from_memo, to_memo
@@ -256,7 +257,7 @@ class SupervisorLink:
         code = f"exit code {FAILED}"
         if not status.message.startswith(code):
             return status.message
-        fault = fault_in(log_path(self.state, status.instance))
+        fault = fault_in(last_lines(log_path(self.state, status.instance)))
         return status.message.replace(code, f"{code}: {fault}", 1) if fault else status.message
 
     def take_over(self) -> int:

@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Iterator
 from typing import Final, NamedTuple, TypeVar
 
 from rosrm.core.supervisor.rules import Key, LimitRule
+from rosrm.runtime.signalling import send
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
 from rosrm.supervisor.spawn import TRANSIENT, Attempt, Scheduler, ScheduleRefused, SpawnError
@@ -198,7 +199,7 @@ def _nice_fault(pid: int, limits: LimitRule) -> dict[str, str]:
     if actual == limits.nice:
         return {}
     if limits.required:
-        os.kill(pid, signal.SIGKILL)
+        send(pid, signal.SIGKILL)
     fault = {"nice": f"it is {actual}, because CAP_SYS_NICE is required for {limits.nice}"}
     _check_required(limits, fault)
     return fault

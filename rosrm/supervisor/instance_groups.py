@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
+from rosrm.runtime.signalling import send
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
@@ -319,8 +320,7 @@ def kill(path: str) -> None:
         for _ in range(_WALKS):
             left = pids(path)
             for pid in left:
-                with contextlib.suppress(OSError):
-                    os.kill(pid, signal.SIGKILL)
+                send(pid, signal.SIGKILL)
             if not left:
                 return
 

@@ -18,9 +18,11 @@ from typing import Final
 from rosrm.core.supervisor.events import Event, Exited, SessionEnded
 from rosrm.core.supervisor.instance import UNKNOWN_EXIT
 from rosrm.core.supervisor.rules import Key
+from rosrm.runtime.signalling import send, send_by, send_to_group
 from rosrm.supervisor import descriptors, own_log, procfs
 from rosrm.supervisor.instance_groups import InstanceGroups
 from rosrm.supervisor.procfs import Stat
+from rosrm.wording import signal_name
 
 #: In place of a pidfd: none can be had, and `look` finds the end of the process.
 _NO_PIDFD: Final = -1
@@ -233,7 +235,7 @@ class ProcessTrees:
                 self._adopted[pid] = key
                 if key is not None and key not in self._sessions:
                     own_log.write(f"killed {pid}, left over by {mark(key)}")
-                    _send(os.kill, pid, signal.SIGKILL, str(pid))
+                    _note(send(pid, signal.SIGKILL), signal.SIGKILL, str(pid))
 
     def _owner(self, pid: int) -> Key | None:
         stat = procfs.read_stat(pid)
@@ -306,7 +308,7 @@ class ProcessTrees:
         have reaped it, and its pid may be that of another process.
         """
         if key not in self._in_foreign_session:
-            _send(os.killpg, leader, number, f"the group {leader}")
+            _note(send_to_group(leader, number), number, f"the group {leader}")
             return
         self.watch_strays(key, _below(leader))
         _send_to(leader, self._taken_over[leader], number)
@@ -314,7 +316,7 @@ class ProcessTrees:
     def kill(self, found: Iterable[Stat]) -> None:
         """Send SIGKILL to processes that belong to no instance any more."""
         for stat in found:
-            _send(os.kill, stat.pid, signal.SIGKILL, str(stat.pid))
+            _note(send(stat.pid, signal.SIGKILL), signal.SIGKILL, str(stat.pid))
 
     # --- the selector -------------------------------------------------------------------------
 
@@ -346,17 +348,11 @@ def mark(key: Key) -> str:
 
 
 def _send_to(pid: int, pidfd: int, number: int) -> None:
-    if pidfd == _NO_PIDFD:
-        _send(os.kill, pid, number, str(pid))
-    else:
-        _send(signal.pidfd_send_signal, pidfd, number, str(pid))
+    why = send(pid, number) if pidfd == _NO_PIDFD else send_by(pidfd, number)
+    _note(why, number, str(pid))
 
 
-def _send(call: Callable[[int, int], None], target: int, number: int, what: str) -> None:
-    """Send a signal; ignore a process that is gone, and log one of another user."""
-    try:
-        call(target, number)
-    except ProcessLookupError:
-        return
-    except PermissionError as error:
-        own_log.write(f"signal {number} to {what}: {error.strerror}")
+def _note(why: str, number: int, what: str) -> None:
+    """Log why a signal was refused."""
+    if why:
+        own_log.write(f"{signal_name(number)} to {what}: {why}")

@@ -99,7 +99,7 @@ def open_pidfd(pid: int) -> int:
         raise
     except OSError:
         with contextlib.suppress(PermissionError):  # it runs as another user
-            os.kill(pid, 0)  # a refused call does not tell that the process has ended
+            os.kill(pid, 0)  # noqa: TID251 - a question; a refused call does not tell that the process has ended
         return -1
 
 
@@ -219,7 +219,7 @@ def find_marked(supervisor: str) -> dict[str, list[Stat]]:
 def group_is_alive(leader: int) -> bool:
     """Return True if the group has a process; call this right after the leader was reaped."""
     try:
-        os.killpg(leader, 0)
+        os.killpg(leader, 0)  # noqa: TID251 - a question
     except ProcessLookupError:
         return False
     except PermissionError:

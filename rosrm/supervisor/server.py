@@ -25,6 +25,7 @@ from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.model import start_trace
 from rosrm.runtime.oom_score import score_of_children
+from rosrm.runtime.signalling import send
 from rosrm.supervisor import (
     adoption,
     descriptors,
@@ -386,7 +387,7 @@ class Server:
         self._stop_watching(start)
         os.close(start.log)
         self._stuck[start.attempt.pid] = (start.key[0], start.attempt.step)
-        os.kill(start.attempt.pid, signal.SIGKILL)
+        send(start.attempt.pid, signal.SIGKILL)
 
     def _abandon_late(self, now: float) -> None:
         """Report the starts that a path holds up."""

@@ -7,14 +7,13 @@ block, also after an exception, the parts are ended by pid.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import signal
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
@@ -28,9 +27,12 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import HostRow, Listing, ProcessRow
 from rosrm.ros.master_connection import MasterClient
 from rosrm.runtime.bootstrap import command_line, hand_over, interrupts_held
+from rosrm.runtime.log_tail import last_lines
 from rosrm.runtime.settings_check import SettingsSource
+from rosrm.runtime.signalling import send
 from rosrm.supervisor import procfs
 from rosrm.testing.loopback import settings_on_this_machine
+from rosrm.wording import ending_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -185,9 +187,11 @@ class LocalCluster:
         stopped: set[int] = set()
         # A process that is stopped by a signal starts no other, so the loop ends.
         while found := _processes_of(self.directory / "hosts", name, pids) - stopped:
-            _send(found, signal.SIGSTOP)
+            for pid in found:
+                send(pid, signal.SIGSTOP)
             stopped |= found
-        _send(stopped, signal.SIGKILL)
+        for pid in stopped:
+            send(pid, signal.SIGKILL)
         slave.wait(_END)
         return at
 
@@ -249,8 +253,8 @@ class LocalCluster:
     def _check_parts(self) -> None:
         for part in (self.master, *self.slaves.values()):
             if part is not None and part.process.poll() not in (None, 0):
-                tail = part.log.read_text(errors="replace")[-2000:]
-                raise RosrmError(f"{part.name} ended with {part.process.returncode}:\n{tail}")
+                tail = "\n".join(last_lines(part.log))[-2000:]
+                raise RosrmError(f"{part.name}: {ending_of(part.process.returncode)}:\n{tail}")
 
     # --- begin and end -------------------------------------------------------------------
 
@@ -311,12 +315,6 @@ def _processes_of(hosts: Path, name: str, slaves: Mapping[str, int]) -> set[int]
         return host == name
 
     return {pid for pid in parents if is_here(pid)}
-
-
-def _send(pids: Iterable[int], number: signal.Signals) -> None:
-    for pid in pids:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, number)
 
 
 def _end_all(parts: Sequence[Part]) -> None:

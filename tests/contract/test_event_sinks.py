@@ -89,7 +89,7 @@ def test_a_command_that_fails_is_a_failure_with_its_last_line():
     """So that the notice is sent again."""
     sink = Command(CommandOptions(("sh", "-c", "echo first >&2; echo no horn >&2; exit 3")))
 
-    with pytest.raises(RosrmError, match="sh ended with 3: no horn"):
+    with pytest.raises(RosrmError, match="sh: exit code 3: no horn"):
         sink.send(EventSinkContract().notices()[:1])
 
 

@@ -130,7 +130,7 @@ def test_a_part_that_dies_ends_the_rest(terminal, tmp_path) -> None:
         _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 1
     assert "the slave of host-" in errors
-    assert "has ended (SIGKILL). Its log is " in errors
+    assert "has ended (killed by SIGKILL). Its log is " in errors
     assert "registered with master" in errors
     assert not any(alive(row["pid"]) for row in rows)
     assert Path(state, "host-1.log").exists()

@@ -8,6 +8,7 @@ from rosrm.wording import (
     amount,
     counted,
     duration,
+    ending_of,
     sanitized,
     size,
     standing_for,
@@ -84,3 +85,15 @@ def test_a_noun_has_its_article() -> None:
     """Refusals of names are sentences."""
     assert with_article("host") == "a host"
     assert with_article("application") == "an application"
+
+
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (0, "exit code 0"), (3, "exit code 3"), (-15, "killed by SIGTERM"),
+        (-35, "killed by signal 35"), (-400, "killed by signal 400"),
+    ],
+)  # fmt: skip
+def test_each_return_code_has_a_phrase(code, text):
+    """A signal without a name, as a real-time signal, is shown by its number."""
+    assert ending_of(code) == text

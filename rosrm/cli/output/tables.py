@@ -19,6 +19,7 @@ from rosrm.wording import (
     amount,
     counted,
     duration,
+    ending_of,
     listed,
     percent,
     size,
@@ -168,7 +169,7 @@ def why(row: ProcessRow) -> str:
     if row.reason:
         parts.append(row.reason)
     elif row.state == "failed" and row.exit_code is not None:
-        parts.append(f"exit code {row.exit_code}")
+        parts.append(ending_of(row.exit_code))
     if row.restarts and "restart" not in row.reason:
         parts.append(counted(row.restarts, "restart"))
     if row.migrations:

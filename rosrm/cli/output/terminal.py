@@ -67,8 +67,10 @@ class Terminal:
             screen.console.show_cursor(False)
             screen.refresh()
 
-        handlers = {signal.SIGTSTP: stop, signal.SIGCONT: go_on, **dict.fromkeys(_ENDING, _exit)}
-        before: dict[signal.Signals, Any] = {}
+        before: dict[int, Any] = {}
+        handlers: dict[int, Any] = {
+            signal.SIGTSTP: stop, signal.SIGCONT: go_on, **dict.fromkeys(_ENDING, _exit),
+        }  # fmt: skip
         for number, handler in handlers.items():
             if signal.getsignal(number) is not signal.SIG_IGN:  # as by nohup
                 before[number] = signal.signal(number, handler)

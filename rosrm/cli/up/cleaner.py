@@ -47,7 +47,7 @@ def stop_supervisors(directory: Path) -> None:
         for lock in locks:
             with suppress(OSError, ValueError):  # it has ended, or has not written its pid yet
                 if not _is_free(lock):
-                    os.kill(int(lock.read_text()), number)
+                    os.kill(int(lock.read_text()), number)  # noqa: TID251 - it imports no rosrm
         if _wait_until_free(locks):
             return
 

@@ -11,16 +11,18 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 from rosrm import clocks
 from rosrm.cli.up import cleaner
 from rosrm.errors import ConfigError, Refused, RosrmError
 from rosrm.model.rows import Listing
+from rosrm.runtime.log_tail import last_lines
 from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.runtime.signalling import send
 from rosrm.supervisor import procfs
 from rosrm.testing.local_cluster import LocalCluster, Part
-from rosrm.wording import listed
+from rosrm.wording import ending_of, listed
 
 #: Seconds for all hosts to register.
 _REGISTER: Final = 30.0
@@ -117,15 +119,14 @@ class UpCluster(LocalCluster):
     def _end_others(self, *numbers: int) -> None:
         """End processes whose supervisor was killed; raise `StillRunning` if some do not end."""
         for number in numbers:
-            for pid in self._left():
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, number)
+            refused = {pid: why for pid in self._left() if (why := send(pid, number))}
             until = clocks.boot_time() + _END
             while (left := self._left()) and clocks.boot_time() < until:
                 time.sleep(_LOOK)
             if not left:
                 return
-        names = listed(f"{what} (pid {pid})" for pid, what in left.items())
+        marks = {pid: f"{pid}: {refused[pid]}" if pid in refused else f"{pid}" for pid in left}
+        names = listed(f"{what} (pid {marks[pid]})" for pid, what in left.items())
         raise StillRunning(
             f"{names} cannot be killed. A process that waits for a file system without an answer "
             "ends when that answers, or is unmounted"
@@ -154,7 +155,7 @@ class UpCluster(LocalCluster):
 def _error_of(part: Part) -> RosrmError:
     """Return the error of a part that has ended: its own message, or how it ended and its log."""
     role = "master" if part.name == "master" else "slave"
-    lines = part.log.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = last_lines(part.log)
     own = f"rosrm {role}: "
     for at, line in enumerate(lines):
         if line.startswith(own):
@@ -162,14 +163,9 @@ def _error_of(part: Part) -> RosrmError:
     subject = "the master" if role == "master" else f"the slave of {part.name}"
     last = "".join(f"\n    {line}" for line in lines[-_LINES:])
     return PartEnded(
-        f"{subject} has ended ({_how(part)}). Its log is {part.log}, in a directory that stays; "
-        f"its last lines:{last}"
+        f"{subject} has ended ({ending_of(part.process.returncode)}). Its log is {part.log}, in a "
+        f"directory that stays; its last lines:{last}"
     )
-
-
-def _how(part: Part) -> str:
-    code = part.process.returncode
-    return f"exit code {code}" if code >= 0 else signal.Signals(-code).name
 
 
 @contextlib.contextmanager
@@ -186,18 +182,23 @@ def cleaned(directory: Path, *, keep: bool) -> Iterator[None]:
     lock = _claim(directory)
     with subprocess.Popen(
         [sys.executable, "-I", "-S", cleaner.__file__, str(directory)],
-        stdin=subprocess.PIPE, pass_fds=[lock], start_new_session=True,
+        stdin=subprocess.PIPE, bufsize=0, pass_fds=[lock], start_new_session=True,
     ) as process:  # fmt: skip
         os.close(lock)  # the cleaner holds the lock
         assert process.stdin is not None
         if keep:
-            process.stdin.write(cleaner.KEEP)
-            process.stdin.flush()
+            _keep(process.stdin)
         try:
             yield
         except (PartEnded, StillRunning):
-            process.stdin.write(cleaner.KEEP)
+            _keep(process.stdin)
             raise
+
+
+def _keep(cleaner_input: IO[bytes]) -> None:
+    """Tell the cleaner that the directory stays; one that was killed removes nothing."""
+    with contextlib.suppress(BrokenPipeError):
+        cleaner_input.write(cleaner.KEEP)
 
 
 def _claim(directory: Path) -> int:

@@ -6,7 +6,7 @@ import signal
 from typing import Final, Literal
 
 from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
-from rosrm.wording import size
+from rosrm.wording import ending_of, size
 
 Phase = Literal[
     "held", "starting", "running", "backoff", "stopping",
@@ -157,12 +157,12 @@ def ending(instance: Instance) -> str:
     if instance.fault:
         return instance.fault
     if instance.exit_signal:
-        return f"killed by {signal_name(instance.exit_signal)}"
+        return ending_of(-instance.exit_signal)
     if instance.exit_code == UNKNOWN_EXIT and instance.adopted:
         return "ended; its exit code is not known, because rosrm did not start this run"
     if instance.exit_code == UNKNOWN_EXIT:
         return "ended while its host or its supervisor was down: its exit code is not known"
-    return f"exit code {instance.exit_code}"
+    return ending_of(instance.exit_code)
 
 
 def killed_for_memory(used: float, limit: float) -> str:
@@ -171,11 +171,3 @@ def killed_for_memory(used: float, limit: float) -> str:
         return f"killed: used {size(used)} of {size(limit)}"
     of_limit = f" of {size(limit)}" if limit else ""
     return f"killed: its host ran out of memory; it used {size(used)}{of_limit}"
-
-
-def signal_name(number: int) -> str:
-    """Return the name of a signal: "SIGTERM" for 15, "signal 34" for a real-time signal."""
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"

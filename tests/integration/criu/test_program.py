@@ -60,7 +60,7 @@ def test_where_no_criu_starts_the_error_has_each_reason(tmp_path):
         find(tmp_path / "prefix")
     said = str(raised.value)
     assert "prefix/bin/criu cannot be started: the C library that it names is missing" in said
-    assert "`--version` ended with code 127 and printed 'libz is missing'" in said
+    assert "`--version` printed 'libz is missing' (exit code 127)" in said
     assert said.endswith("`scripts/install_criu.sh` of rosrm's repository installs one in a folder")
 
 
@@ -115,8 +115,8 @@ def test_a_failure_reports_the_cause_of_the_log(tmp_path):
     [
         ("echo 'Error: no such option' >&2; exit 2", "no such option"),
         ("echo 'criu: what is --tree?'; echo 'Try --help'; exit 2", "criu: what is --tree?"),
-        ("exit 3", "it ended with code 3 without a reason"),
-        ("kill -9 $$", "it ended with code -9 without a reason"),
+        ("exit 3", "exit code 3, without a reason"),
+        ("kill -9 $$", "killed by SIGKILL, without a reason"),
     ],
 )
 def test_a_failure_without_a_log_reports_the_output(tmp_path, body, expected):

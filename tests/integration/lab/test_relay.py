@@ -50,7 +50,7 @@ def test_a_command_that_is_not_there(lab, tmp_path):
     text = tmp_path / "text"
     text.write_text("no program")
     assert lab.exec("host1", [str(text)], check=False).returncode == 126
-    with pytest.raises(LabError, match="no-such-command on host1 ended with 127"):
+    with pytest.raises(LabError, match="no-such-command on host1: exit code 127"):
         lab.exec("host1", ["no-such-command"])
 
 

@@ -22,6 +22,7 @@ from typing import Final, Literal
 from rosrm import clocks
 from rosrm.errors import LabError
 from rosrm.runtime import cgroups
+from rosrm.runtime.signalling import send
 from rosrm_lab.plan import PREFIX, HostPlan
 
 Leaf = Literal["limited", "free", "own"]
@@ -141,8 +142,7 @@ def kill(hierarchies: Sequence[Hierarchy], lab: str, host: str = "") -> None:
     deadline = clocks.boot_time() + _GONE
     while pids := members(hierarchies, lab, host):
         for pid in pids:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
+            send(pid, signal.SIGKILL)
         if clocks.boot_time() > deadline:
             raise LabError(
                 f"processes of lab {lab!r} do not end, {_GONE:g} s after SIGKILL: "

@@ -17,6 +17,7 @@ from typing import Final
 from rosrm import clocks
 from rosrm.errors import ConfigError, LabError
 from rosrm.runtime.ros_wheels import without_bootstrapper
+from rosrm.runtime.signalling import send_by
 from rosrm_lab import groups, store
 from rosrm_lab import plan as names
 from rosrm_lab.groups import Hierarchy, Leaf
@@ -187,7 +188,7 @@ def power_off(hierarchies: Sequence[Hierarchy], lab: str, host: str, birth: Birt
     if birth is not None and birth.alive:
         with contextlib.suppress(ProcessLookupError), _pid_descriptor(birth.pid) as descriptor:
             if birth.alive:  # now the descriptor cannot be a later process's
-                signal.pidfd_send_signal(descriptor, signal.SIGKILL)
+                send_by(descriptor, signal.SIGKILL)
                 # PID 1 of a namespace ends last: all other processes have ended before.
                 if not _readable(descriptor, _END):
                     raise LabError(f"host {host} of lab {lab!r} did not end within {_END:g} s")

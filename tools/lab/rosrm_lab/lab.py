@@ -15,6 +15,7 @@ from typing import IO, TYPE_CHECKING, Any, Final
 
 from rosrm.errors import ConfigError, LabError
 from rosrm.supervisor.procfs import boot_id
+from rosrm.wording import ending_of
 from rosrm_lab import groups, needs, store
 from rosrm_lab.host import DATA, entrance
 from rosrm_lab.plan import HostPlan, LabPlan, check_name, check_usable, switch_namespace
@@ -252,7 +253,7 @@ class Lab:
         said, troubles = out.decode(errors="replace"), err.decode(errors="replace")
         if check and process.returncode:
             raise LabError(
-                f"{command[0]} on {host} ended with {process.returncode}: "
+                f"{command[0]} on {host}: {ending_of(process.returncode)}: "
                 f"{troubles.strip() or said.strip() or 'it said nothing'}"
             )
         return subprocess.CompletedProcess(list(command), process.returncode, said, troubles)

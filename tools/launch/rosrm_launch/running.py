@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import signal
@@ -15,8 +14,9 @@ from typing import Final
 from pydantic import ValidationError
 
 from rosrm.errors import ConfigError, LaunchError
+from rosrm.runtime.signalling import send_to_group
 from rosrm.slave.launch.ament_index import find_package, search_path
-from rosrm.wording import get_close_matches, listed
+from rosrm.wording import ending_of, get_close_matches, listed
 from rosrm_launch.model import Failure, LaunchModel
 
 #: Ends of the names of launch files.
@@ -77,21 +77,17 @@ def resolve(
                 "`--resolve-timeout` allows more"
             ) from None
         finally:  # also what the launch file has started itself
-            _kill(process.pid)
+            send_to_group(process.pid, signal.SIGKILL)
     return _answer(file, output, process.returncode)
-
-
-def _kill(group: int) -> None:
-    with contextlib.suppress(ProcessLookupError):
-        os.killpg(group, signal.SIGKILL)
 
 
 def _answer(file: Path, output: bytes, status: int) -> LaunchModel:
     try:
         plain = json.loads(output)
     except ValueError:
-        how = f"with exit code {status}" if status >= 0 else f"by signal {-status}"
-        raise ConfigError(f"{file}: the resolver ended {how} and without a result") from None
+        raise ConfigError(
+            f"{file}: the resolver ended without a result: {ending_of(status)}"
+        ) from None
     try:
         if "failure" in plain:
             raise ConfigError(Failure.model_validate(plain).failure)

@@ -13,6 +13,7 @@ from typing import Final
 
 from rosrm import clocks
 from rosrm.errors import PortableError
+from rosrm.runtime.signalling import send
 from rosrm.supervisor.procfs import read_environment
 from rosrm_criu.control.directory import make
 from rosrm_criu.control.messages import (
@@ -220,11 +221,8 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
         write_message(directory, request)
     except OSError as error:
         raise PortableError(f"{directory} cannot be written: {error.strerror}") from None
-    if pid is not None:
-        try:
-            os.kill(pid, SIGNAL)
-        except OSError as error:
-            raise PortableError(f"process {pid} cannot be woken: {error.strerror}") from None
+    if pid is not None and (why := send(pid, SIGNAL)):
+        raise PortableError(f"process {pid} cannot be woken: {why}")
 
 
 def listens(pid: int) -> bool:

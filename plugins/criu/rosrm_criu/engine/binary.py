@@ -6,7 +6,6 @@ Search order: the environment variable `ROSRM_CRIU` (a path), the private prefix
 
 from __future__ import annotations
 
-import contextlib
 import os
 import re
 import select
@@ -22,6 +21,9 @@ from typing import Final
 
 from rosrm import clocks
 from rosrm.errors import CriuError
+from rosrm.runtime.log_tail import last_lines
+from rosrm.runtime.signalling import send_to_group
+from rosrm.wording import ending_of
 from rosrm_criu.engine.criu_log import causes, first_words
 
 #: Environment variable with the path of the program; if it is set, nothing else is searched.
@@ -106,7 +108,7 @@ class CriuBinary:
         if code is None:
             why = f"it was not done after {timeout:g} s and was ended"
         else:
-            why = _why(log, output) or f"it ended with code {code} without a reason"
+            why = _why(log, output) or f"{ending_of(code)}, without a reason"
         raise CriuError(f"{what}: {why} (its log: {log})")
 
 
@@ -167,8 +169,8 @@ def opened(program: Path) -> CriuBinary:
     if answer.returncode != 0 or version is None:
         line = (answer.stderr.strip() or answer.stdout.strip() or "nothing").splitlines()[-1]
         raise CriuError(
-            f"{program} is no CRIU that works: `--version` ended with code {answer.returncode} "
-            f"and printed {line!r}"
+            f"{program} is no CRIU that works: `--version` printed {line!r} "
+            f"({ending_of(answer.returncode)})"
         )
     return CriuBinary((str(program),), version[1])
 
@@ -202,8 +204,7 @@ def _end_of(process: subprocess.Popen[bytes], timeout: float) -> int | None:
         has_ended = _wait_for_end(process.pid, timeout)
     finally:
         if not has_ended:  # also if this wait is interrupted: the process would never be reaped
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(process.pid, signal.SIGKILL)
+            send_to_group(process.pid, signal.SIGKILL)
         code = process.wait()
     return code if has_ended else None
 
@@ -232,8 +233,5 @@ def _wait_for_end(pid: int, timeout: float) -> bool:
 
 def _why(log: Path, output: str) -> str:
     """Return the cause of a failure from the log, or from earlier output if there is no log."""
-    try:
-        written = log.read_text(errors="replace")
-    except OSError:
-        written = ""
+    written = "\n".join(last_lines(log))
     return "; ".join(causes(written) or causes(output) or first_words(output))

@@ -25,6 +25,7 @@ from typing import Final
 
 from rosrm import clocks
 from rosrm.errors import CriuError
+from rosrm.runtime.signalling import send
 from rosrm_criu.engine.binary import OLDEST, REMEDY, CriuBinary, find
 from rosrm_criu.engine.compatibility import INTERPRETER, facts_of
 
@@ -220,7 +221,7 @@ def _subject(port: int, trial: _Trial) -> Iterator[subprocess.Popen[bytes]]:
         # After the restore it is a new child of this process, with the same pid.
         with contextlib.suppress(ChildProcessError):
             if os.waitpid(process.pid, os.WNOHANG)[0] == 0:
-                os.kill(process.pid, signal.SIGKILL)
+                send(process.pid, signal.SIGKILL)
                 os.waitpid(process.pid, 0)
         os.write(trial.clearer, b"\n")
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 import time
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final
 
 from rosrm import clocks
+from rosrm.runtime import signalling
 from rosrm.supervisor.procfs import everyone, inner_pid, read_stat
 
 #: Namespaces that CRIU must share with the process that it dumps, each with its nsenter option.
@@ -156,8 +156,7 @@ def wait_until_stopped(pids: Iterable[int], timeout: float) -> bool:
     return True
 
 
-def send(pids: Iterable[int], number: signal.Signals) -> None:
-    """Send a signal to each process that still exists."""
+def send(pids: Iterable[int], number: int) -> None:
+    """Send a signal to each process that still exists, and is not another user's."""
     for pid in pids:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, number)
+        signalling.send(pid, number)

@@ -34,6 +34,7 @@ if not __package__:
 
 from rosrm import clocks
 from rosrm.errors import CriuError
+from rosrm.runtime.signalling import send, send_to_group
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm_criu.engine import image, process_tree, put_back, restore, restore_result
 from rosrm_criu.engine.binary import CriuBinary, opened
@@ -306,8 +307,7 @@ def _attend(root: int, child: int) -> int:
     while (status := _reap(child, os.WNOHANG)) is None:
         number = signal.sigwaitinfo(awaited).si_signo
         if number != signal.SIGCHLD:
-            with contextlib.suppress(ProcessLookupError):
-                os.killpg(root, number)
+            send_to_group(root, number)
     return status
 
 
@@ -336,7 +336,7 @@ def _end_as(status: int) -> NoReturn:
         if number != signal.SIGKILL:
             signal.signal(number, signal.SIG_DFL)
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
-        os.kill(os.getpid(), number)
+        send(os.getpid(), number)
     sys.exit(os.waitstatus_to_exitcode(status) if not number else 128 + number)
 
 

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from rosrm.errors import TransferError
+from rosrm.runtime.signalling import send
 from rosrm_criu.transfer.form import Offer
 
 
@@ -85,12 +86,12 @@ def _fetch(asked: dict[str, Any]) -> Mapping[str, Any]:
     if not line:
         raise TransferError("the fetch was stopped before it began")
     asked = json.loads(line)
-    _when_input_ends(lambda: os.kill(os.getpid(), signal.SIGTERM))
+    _when_input_ends(lambda: send(os.getpid(), signal.SIGTERM))
     offer, target = Offer.from_json(asked.pop("offer")), Path(asked.pop("target"))
     return asdict(receive(offer, target, **asked, identity=identity, before_placing=ignore))
 
 
-def _when_input_ends(do: Callable[[], None]) -> None:
+def _when_input_ends(do: Callable[[], object]) -> None:
     """Call a function, in another thread, when the parent closes the standard input or ends."""
 
     def wait() -> None:

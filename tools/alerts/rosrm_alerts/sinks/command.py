@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rosrm import Notice, PositiveSeconds, RosrmError, SkipPlugin
+from rosrm.wording import ending_of
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Command:
             raise RosrmError(f"{program} cannot be started: {fault}") from None
         if done.returncode:
             last = done.stderr.strip().splitlines()[-1:]
-            raise RosrmError(": ".join([f"{program} ended with {done.returncode}", *last]))
+            raise RosrmError(": ".join([f"{program}: {ending_of(done.returncode)}", *last]))
 
     def close(self) -> None:
         """Do nothing; no command outlives `send`."""
