@@ -8,10 +8,14 @@ no compaction. Where it is missing, the recorded start of each instance counts.
 from __future__ import annotations
 
 import os
+from math import inf
+from typing import Final
 
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import own_log, paths, procfs
+
+_NONE: Final = ContactReported(-inf, -inf)
 
 
 class LastContact:
@@ -44,11 +48,14 @@ class LastContact:
 
 
 def read(state: str) -> ContactReported:
-    """Return the times stored since this machine's start; 0.0: none."""
+    """Return the times stored since this machine's start; `-inf`: none.
+
+    The times of a fence that was due before that start are negative, so 0.0 would be newer.
+    """
     try:
         with open(os.path.join(state, paths.HEARD), encoding="ascii") as file:
             boot, at, alive = file.read(100).split()
         newest = ContactReported(float(at), float(alive))
     except (OSError, ValueError):
-        return ContactReported(0.0)
-    return newest if boot == procfs.boot_id() else ContactReported(0.0)
+        return _NONE
+    return newest if boot == procfs.boot_id() else _NONE

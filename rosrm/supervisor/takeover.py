@@ -12,6 +12,7 @@ and its restart policy decides.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import inf
 
 from rosrm import clocks
 from rosrm.core.supervisor.events import Event, Exited, Resumed, SessionEnded, Spawned, SpawnFailed
@@ -39,7 +40,7 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
         if not recorded.same_boot:
             _restart_clock(instance, clocks.boot_time())
         alive = instance.fence is not None and instance.fence.alive
-        instance.heard = max(instance.heard, newest.at, newest.alive if alive else 0.0)
+        instance.heard = max(instance.heard, newest.at, newest.alive if alive else -inf)
         core.restore(instance)
         leader = procfs.read_stat(instance.pid) if instance.pid and recorded.same_boot else None
         birth = recorded.births[instance.key]

@@ -155,9 +155,13 @@ def test_the_next_supervisor_ends_an_expired_instance(host, client):
 
 
 def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
-    """The length of the outage is unknown, so a successor may run elsewhere: no restart."""
+    """The length of the outage is unknown, so a successor may run elsewhere: no restart.
+
+    That holds also for a fence that is longer than the machine runs.
+    """
+    fence = Fence(clocks.boot_time() + 1000.0, 0.0)
     pids = [host.sleeper(client, "driver", restart=ALWAYS)]
-    pids.append(host.sleeper(client, "one", restart=ALWAYS, fence=Fence(1000.0, 0.0)))
+    pids.append(host.sleeper(client, "one", restart=ALWAYS, fence=fence))
     lose_power(host, client, *pids)
     client = host.connect()
     host.ended_after_connect(client, "one")
