@@ -16,7 +16,7 @@ _PART: Final = re.compile(
 )
 #: What a shell would interpret outside quotes.
 _SYNTAX: Final = re.compile(
-    r"&&|\|\||>>|<<|[|&;<>`*()]|\$[\w{(\[@#?$!*-]+|(?:(?<=\s)|\A)\#|(?<=\s)~(?=/|\s|\Z)|"
+    r"&&|\|\||>>|<<|[|&;<>`*()]|\$[\w{(\[@#?$!*-]+|(?:(?<=\s)|\A)\#|(?<=\s)~(?!_)|"
     r"\{[^\s{}]*(?:,|\.\.)[^\s{}]*\}"
 )
 #: What a shell would interpret in double quotes, too.
