@@ -21,7 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, ClassVar, Final, TypeVar
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.errors import place_in_stack
 
 T = TypeVar("T")
@@ -212,7 +212,7 @@ class _Watch:
         """Start the thread, unless this process has it already."""
         if cls._pid != os.getpid():
             cls._pid, cls.lock = os.getpid(), threading.Lock()
-            threading.Thread(target=cls._watch, name="rosrm-plugins", daemon=True).start()
+            threads.start(cls._watch, "rosrm-plugins", again=True)
 
     @classmethod
     def _watch(cls) -> None:

@@ -10,11 +10,11 @@ import logging
 import os
 import queue
 import re
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
+from rosrm import threads
 from rosrm.core.master.commands import Command
 from rosrm.core.master.events import Event, ReadingsReceived, StatusesReceived, UsagesReceived
 from rosrm.errors import ConfigError
@@ -74,8 +74,7 @@ class Recorder:
                 f"record: nothing can be written into {directory}: {error.strerror}. Give another "
                 f"`record.directory`, or leave it out to record nothing"
             ) from None
-        self._thread = threading.Thread(target=self._write, name="rosrm recorder", daemon=True)
-        self._thread.start()
+        self._thread = threads.start(self._write, "rosrm recorder")
 
     @property
     def waiting(self) -> int:

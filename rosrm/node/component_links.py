@@ -13,11 +13,12 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
 
 from rclpy.node import Node
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.component import link
 from rosrm.node.identity import made_for
 from rosrm.runtime.signalling import send
@@ -48,7 +49,7 @@ class ComponentLinks:
         self._make = make
         self._log = log
         self.nodes: list[Node] = []
-        threading.Thread(target=self._listen, name="links", daemon=True).start()
+        threads.start(self._listen, "links", again=True)
 
     def close(self) -> None:
         """Destroy all nodes; their processes end with this one."""
@@ -77,7 +78,7 @@ class ComponentLinks:
             self._log.error(f"a component cannot be loaded now: {error.strerror}")
             time.sleep(_RETRY)
             return
-        threading.Thread(target=self._serve, args=(connection,), daemon=True).start()
+        threads.start(partial(self._serve, connection), "link")
 
     def _serve(self, connection: socket.socket) -> None:
         """Make the node of a process, and destroy it when the process asks for that or ends."""

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from rosrm import clocks
 from rosrm.keys.security import Member
 from rosrm.ros import qos
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm_msgs import msg
 
+#: Seconds for which the figures of a message count, and after which the subscription is replaced.
+_FRESH: Final = 5.0
+_SILENCE: Final = 15.0
 #: Figures that are numbers; docs/reference/protocol.md has their meanings.
 _NUMBERS: Final = (
     "hosts", "cycles", "missed", "dropped", "strangers", "cpu_s", "turn_s", "write_s", "decide_s",
@@ -22,16 +26,33 @@ _NUMBERS: Final = (
 class LoadReader:
     """Follows `master_load`.
 
-    Attributes:
-        newest: figures of the newest message, with the oldest of its readings; empty: none came.
+    A subscription that was made while the process could open no further file may be silent for
+    ever. So a silent one is replaced.
     """
 
-    def __init__(self, endpoints: SealedEndpoints[Member], topic: str) -> None:
-        self.newest: Mapping[str, float] = {}
-        endpoints.follow(msg.Event, topic, qos.LOAD, self._take)
+    def __init__(
+        self, endpoints: SealedEndpoints[Member], topic: str,
+        clock: Callable[[], float] = clocks.boot_time,
+    ) -> None:  # fmt: skip
+        self._endpoints, self._topic, self._clock = endpoints, topic, clock
+        self._newest: Mapping[str, float] = {}
+        self._follow()
+
+    def newest(self) -> Mapping[str, float]:
+        """Return the figures of the newest message; empty: none came in the last seconds."""
+        silence = self._clock() - self._at
+        if silence > _SILENCE:
+            self._endpoints.participant.node.destroy_subscription(self._subscription)
+            self._follow()
+        return self._newest if silence <= _FRESH else {}
+
+    def _follow(self) -> None:
+        self._at = self._clock()
+        self._newest = {}
+        self._subscription = self._endpoints.follow(msg.Event, self._topic, qos.LOAD, self._take)
 
     def _take(self, message: msg.Event, _run: bytes) -> None:
-        self.newest = figures(json.loads(message.data))
+        self._newest, self._at = figures(json.loads(message.data)), self._clock()
 
 
 def figures(data: Mapping[str, Any]) -> Mapping[str, float]:

@@ -371,7 +371,7 @@ class MasterClient:
             from rosrm.ros.load_reader import LoadReader  # noqa: PLC0415 - imports rclpy
 
             self._load = LoadReader(self._endpoints, self._names(names.MASTER_LOAD))
-        return self._load.newest
+        return self._load.newest()
 
     def spin(self, timeout: float) -> None:
         """Handle incoming messages for at most `timeout` seconds."""

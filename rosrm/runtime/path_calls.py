@@ -19,7 +19,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import Any, Final
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.errors import RosrmError
 
 #: Seconds for a call.
@@ -82,7 +82,7 @@ class _Lane:
         self.calls: SimpleQueue[_Call | None] = SimpleQueue()
         self.current: _Call | None = None
         self._clock, self._finish = clock, finish
-        threading.Thread(target=self._work, name=name, daemon=True).start()
+        threads.start(self._work, name, again=True)
 
     def _work(self) -> None:
         while (call := self.calls.get()) is not None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import queue
-import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Any
+
+from rosrm import threads
 
 
 class Worker:
@@ -46,7 +47,7 @@ class Worker:
     def _started(self) -> queue.SimpleQueue[Callable[[], None]]:
         if self._jobs is None:
             jobs: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-            threading.Thread(target=_work, args=(jobs,), name=self._name, daemon=True).start()
+            threads.start(partial(_work, jobs), self._name, again=True)
             self._jobs = jobs
         return self._jobs
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, Final
 
-from rosrm import clocks
-from rosrm.errors import PluginError, Refused, RosrmError
+from rosrm import clocks, threads
+from rosrm.errors import PluginError, Refused, RosrmError, describe_fault
 from rosrm.extensions.contracts import Executor
 from rosrm.extensions.discovery import definition
 from rosrm.extensions.guard import guarded
@@ -127,9 +127,18 @@ class Executors:
             timer.cancel()
             self._post(partial(settle, outcome))
 
-        threading.Thread(target=work, name=f"executor {name}", daemon=True).start()
-        if timeout > 0.0:
-            timer.start()
+        def fail(fault: BaseException) -> None:
+            timer.cancel()
+            outcome = ExecutorOutcome("failed", f"{name}: {describe_fault(fault)}")
+            self._post(partial(settle, outcome))
+
+        try:
+            if timeout > 0.0:
+                timer.start()
+            threads.start(work, f"executor {name}", failed=fail)
+        except RuntimeError as fault:  # no further thread
+            timer.cancel()
+            raise Refused(f"executor {name} on {here['host']}: {fault}") from None
 
     def _fail(self, strategy: str, error: str) -> None:
         self._failed_at[strategy] = self._clock()

@@ -27,13 +27,14 @@ import math
 import threading
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from operator import methodcaller
 from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.errors import PluginError
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import titled
@@ -260,7 +261,7 @@ class _Lane:
     ) -> None:
         self._name = name
         self._queue: SimpleQueue[Callable[[], None] | None] = queue or SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._thread: threads.Thread | None = None
         self._dismissed = False
 
     def put(self, call: Callable[[], None]) -> None:
@@ -291,8 +292,8 @@ class _Lane:
 
     def _start(self) -> None:
         # A daemon, because a probe that hangs in the kernel must not keep the slave from ending.
-        self._thread = threading.Thread(target=self._serve, name=self._name, daemon=True)
-        self._thread.start()
+        with suppress(RuntimeError):  # no further thread: the probe is late, and the next put tries
+            self._thread = threads.start(self._serve, self._name, again=True)
 
     def _serve(self) -> None:
         # No time-out is needed, because the queue always ends with the None of `end`.

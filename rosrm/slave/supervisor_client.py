@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -12,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.artifacts.cache import without_directories
 from rosrm.component.link import FAILED, fault_in
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
 from rosrm.core.supervisor import events as orders
-from rosrm.errors import SupervisorError, assert_never
+from rosrm.errors import SupervisorError, assert_never, describe_fault
 from rosrm.model.values import Amendment, InstanceId, InstanceState, InstanceStatus
 from rosrm.runtime.log_tail import last_lines
 from rosrm.slave.instance_group import InstanceGroup
@@ -178,10 +177,11 @@ class SupervisorLink:
 
     def listen(self) -> None:
         """Start the thread that receives messages."""
-        thread = threading.Thread(
-            target=self._receive_all, args=[self._client], name="supervisor", daemon=True
-        )
-        thread.start()
+        threads.start(partial(self._receive_all, self._client), "supervisor", failed=self._deaf)
+
+    def _deaf(self, fault: BaseException) -> None:
+        """End the slave, which would receive nothing from the supervisor any more."""
+        self._post(partial(self._end, SupervisorError(describe_fault(fault))))
 
     def _receive_all(self, client: SupervisorClient) -> None:
         """Pass the messages of all successive supervisors to the loop, in a thread of its own."""

@@ -9,7 +9,7 @@ import socket
 import threading
 from typing import Final
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.supervisor.discovery import writable
 
 #: Most bytes that may wait for the peer, beside those in its socket.
@@ -34,7 +34,7 @@ class Outgoing:
         self._peer = peer
         self._lock = threading.Lock()
         self._unsent = bytearray()
-        self._thread: threading.Thread | None = None
+        self._thread: threads.Thread | None = None
         self._took_at = 0.0
         self._gone = False
 
@@ -74,8 +74,15 @@ class Outgoing:
         except BlockingIOError:
             self._unsent += view
             self._took_at = clocks.awake_time()
-            self._thread = threading.Thread(target=self._send_rest, name="orders", daemon=True)
-            self._thread.start()
+            self._start_sending()
+
+    def _start_sending(self) -> None:
+        try:
+            self._thread = threads.start(self._send_rest, "orders", failed=lambda _: self.drop())
+        except RuntimeError as fault:  # no further thread: nothing would send what waits
+            self._gone = True
+            self._unsent.clear()
+            raise OSError(errno.EAGAIN, f"{fault}") from None
 
     def _send_rest(self) -> None:
         """Send the waiting bytes; runs in a thread of its own until nothing waits."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+from rosrm import threads
 from rosrm.errors import PluginError, describe_plugin_fault
 from rosrm.extensions.contracts import HostLabelling, Probe, ProbeContext, ProbeOffer
 from rosrm.extensions.made import MadeProbe, fault_of_labels, unmeasured
@@ -204,9 +205,7 @@ class ProbeContract:
             else:
                 faults.append("")
 
-        thread = threading.Thread(target=read, daemon=True)
-        thread.start()
-        thread.join(self.offer.deadline)
+        threads.start(read, "probe").join(self.offer.deadline)
         assert faults, f"no answer within its own deadline of {self.offer.deadline:g} s"
         assert not faults[0], f"read fails in another thread: {faults[0]}"
         probe.close()

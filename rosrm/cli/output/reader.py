@@ -12,8 +12,11 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 from typing import Final
+
+from rosrm import threads
 
 #: Seconds to the next attempt to end.
 _AGAIN: Final = 0.5
@@ -28,7 +31,7 @@ def needed() -> Iterator[None]:
         yield
         return
     before = signal.signal(signal.SIGPIPE, _end)
-    threading.Thread(target=_watch, args=(descriptor,), daemon=True).start()
+    threads.start(partial(_watch, descriptor), "reader")
     try:
         yield
     finally:

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 from rclpy.serialization import serialize_message
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.node.handoff.state_parts import StateError, StateTopic
 from rosrm.node.managed_node import Mode, NodeEntities
 from rosrm.node.steady_timer import steady_timer
@@ -167,7 +167,7 @@ class _Writer:
         self._ending = False
         self._fault = ""
         self._changed = threading.Condition()
-        self._thread: threading.Thread | None = None
+        self._thread: threads.Thread | None = None
 
     def put(self, sequence: int, blocks: Sequence[Block]) -> None:
         """Queue a snapshot for writing; return at once."""
@@ -177,8 +177,7 @@ class _Writer:
         if (
             self._thread is None
         ):  # not earlier, because writing would delay a successor's announcement
-            self._thread = threading.Thread(target=self._work, name="rosrm snapshots", daemon=True)
-            self._thread.start()
+            self._thread = threads.start(self._work, "rosrm snapshots", again=True)
 
     def close(self) -> None:
         """Write the waiting snapshot, and end the thread."""

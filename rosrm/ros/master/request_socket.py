@@ -9,7 +9,7 @@ import socket
 import threading
 from typing import TYPE_CHECKING, Final
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.keys.security import Authority
 from rosrm.ros import master_socket
 from rosrm.ros.sealed import SealedEndpoints
@@ -51,7 +51,7 @@ class RequestSocket:
             return
         self._listener.listen(_THREADS)
         for number in range(_THREADS):
-            threading.Thread(target=self._work, name=f"requests-{number}", daemon=True).start()
+            threads.start(self._work, f"requests-{number}", again=True)
 
     def _work(self) -> None:
         while not self._closed.is_set():

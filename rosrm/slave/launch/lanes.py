@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from rosrm import threads
 from rosrm.extensions.time_limit import interrupt_thread
 
 #: Takes the outcome of a call: its result, or the exception that it raised.
@@ -62,7 +63,7 @@ class Lanes:
 
         try:
             call.timer.start()
-            threading.Thread(target=work, name=f"start {lane}", daemon=True).start()
+            threads.start(work, f"start {lane}")
         except RuntimeError as fault:  # no further thread: the limit of the user or the group
             self._post(partial(settle, fault))
 

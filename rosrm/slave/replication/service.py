@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import logging
 import queue
-import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
@@ -127,7 +126,7 @@ class ReplicationService:
         self._next_scan = 0.0
         self._budget = float(settings.max_rate)
         self._budget_at = clocks.boot_time()
-        threading.Thread(target=self._work, name="snapshots", daemon=True).start()
+        threads.start(self._work, "snapshots", again=True)
         endpoint.serve(self)
 
     # --- the thread ----------------------------------------------------------------------

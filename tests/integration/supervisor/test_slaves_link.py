@@ -170,3 +170,15 @@ def test_the_shutdown_reaches_one_that_is_just_taking_over(loop) -> None:
     loop.wait(lambda: loop.ended, "the next one has stopped everything")
     assert loop.ended == [""]
     assert not loop.host.alive()
+
+
+def test_a_slave_that_can_receive_no_more_ends_with_the_reason(loop, monkeypatch) -> None:
+    """A fault in the receiving thread would leave a slave that no process can report to."""
+
+    def fail(*_, **__):
+        raise RuntimeError("a bug")
+
+    monkeypatch.setattr(SupervisorClient, "connect", fail)
+    os.kill(loop.pid, signal.SIGKILL)
+    loop.wait(lambda: loop.ended, "the end of the slave")
+    assert "RuntimeError: a bug" in loop.ended[0]

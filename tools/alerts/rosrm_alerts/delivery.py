@@ -8,7 +8,7 @@ from functools import partial
 from operator import methodcaller
 from typing import Final
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.errors import PluginError
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import titled
@@ -43,8 +43,7 @@ class Delivery:
         self._sending_since: float | None = None
         self._wake, self._stop = threading.Event(), threading.Event()
         # A daemon, because a sink that hangs must not keep the process alive.
-        self._thread = threading.Thread(target=self._run, name=f"sink {name}", daemon=True)
-        self._thread.start()
+        self._thread = threads.start(self._run, f"sink {name}", again=True)
 
     def notify(self) -> None:
         """Deliver new notices now."""

@@ -10,6 +10,8 @@ from typing import Any, Final, Literal, cast
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
 
+from rosrm.threads import log_fault
+
 #: Highest number of connections at the same time.
 MOST_CONNECTIONS: Final = 128
 #: Highest number of WebSockets among them, so that pages leave room for requests.
@@ -74,6 +76,9 @@ class Connection(H11Protocol):
                 self.transport, self, tls, server_side=True, ssl_handshake_timeout=HEAD_TIMEOUT
             )
         except OSError:  # also ssl.SSLError and a time-out: the client does not speak TLS
+            transport = None
+        except Exception as fault:  # noqa: BLE001 - otherwise the connection would stay for ever
+            log_fault("a TLS handshake", fault)
             transport = None
         if transport is None:  # the client has left
             self.end()

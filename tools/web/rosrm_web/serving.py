@@ -23,6 +23,7 @@ from rosrm_web.app import create_app
 from rosrm_web.connections import MOST_CONNECTIONS, Connection
 from rosrm_web.guard import Guard
 from rosrm_web.sessions import Sessions
+from rosrm_web.tasks import serve_always
 
 if TYPE_CHECKING:
     from rosrm_web.gateway import Gateway
@@ -165,7 +166,9 @@ async def _serve(
         loop.add_signal_handler(number, stop)
     with suppress(NoMaster, Refused):  # all other errors will not pass
         await gateway.watcher.look()
-    tasks = [loop.create_task(gateway.watcher.run()), loop.create_task(access.follow_file())]
+    tasks = [
+        serve_always(gateway.watcher.run, "watcher"), serve_always(access.follow_file, "tokens"),
+    ]  # fmt: skip
     ready()
     # uvicorn raises the signal again at its end: `stop` takes it.
     await server.serve(sockets=[listener])

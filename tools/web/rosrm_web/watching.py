@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
-from rosrm.errors import NoMaster, RosrmError
+from rosrm.errors import NoMaster, RosrmError, describe_fault
 from rosrm_web.master_link import Busy
 
 if TYPE_CHECKING:
@@ -87,26 +87,23 @@ class Watcher:
             listing = await self._link.ask(self._list)
         except Busy:  # nothing was sent, so the state of the master is as before
             raise
-        except RosrmError as error:
+        except Exception as error:
             state: State = "lost" if self._after >= 0 else "searching"
-            self._set_master(MasterState(state, str(error)))
+            why = str(error) if isinstance(error, RosrmError) else describe_fault(error)
+            self._set_master(MasterState(state, why))
             raise
         self._set_master(MasterState("up", ""))
         events = listing.events
         has_last = bool(events) and events[0].sequence == self._after
         if listing.last_sequence < self._after or (has_last and self._is_other(events[0])):
             self._after = 0  # the next request has the first events of the new journal
-            for forget in self.on_new_journal:
-                forget()
+            _call_all(self.on_new_journal)
             return
         self._after = listing.last_sequence
         self._written = events[-1].wall_time if events else 0.0
         news = events[has_last:]
-        for call in self.on_events if news else ():
-            try:
-                call(news)
-            except Exception:  # noqa: BLE001 - one reader must not stop the others, or the watcher
-                _log.exception("a part of the gateway cannot read new events")
+        if news:
+            _call_all(self.on_events, news)
 
     def _is_other(self, event: EventRow) -> bool:
         """Return True if an event is not the last known one, so that the journal is new."""
@@ -124,5 +121,13 @@ class Watcher:
         self.master = master
         if is_new:
             _log.info("master is %s%s", master.state, f": {master.reason}" if master.reason else "")
-            for call in self.on_master:
-                call(master)
+            _call_all(self.on_master, master)
+
+
+def _call_all(readers: Sequence[Callable[..., None]], *news: object) -> None:
+    """Call each reader; one that raises must not stop the others, or the watcher."""
+    for call in readers:
+        try:
+            call(*news)
+        except Exception:  # noqa: BLE001 - see above
+            _log.exception("a part of the gateway cannot read what is new")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
 
+from rosrm import threads
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, incoming, numbers, outgoing
 from rosrm_criu.engine.restore_result import Outcome
@@ -63,7 +64,7 @@ def remove_when_over(state: Path, number: int, sender: Sender, seconds: float) -
             discard(outgoing(state, number))
         sender.close()
 
-    threading.Thread(target=wait, name="offered image", daemon=True).start()
+    threads.start(wait, "offered image")
 
 
 def withdraw(state: Path, number: int) -> None:

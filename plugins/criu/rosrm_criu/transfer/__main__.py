@@ -18,6 +18,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from rosrm import threads
 from rosrm.errors import TransferError
 from rosrm.runtime.signalling import send
 from rosrm_criu.transfer.form import Offer
@@ -99,7 +100,7 @@ def _when_input_ends(do: Callable[[], object]) -> None:
             pass
         do()
 
-    threading.Thread(target=wait, daemon=True).start()
+    threads.start(wait, "input")
 
 
 if __name__ == "__main__":

@@ -16,10 +16,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
-from rosrm import clocks
+from rosrm import clocks, threads
 from rosrm.errors import TransferError
 from rosrm_criu.transfer.addresses import own_addresses
 from rosrm_criu.transfer.archive import Archive
@@ -96,7 +97,7 @@ class _Server:
 
     def start(self) -> None:
         """Accept connections in the background."""
-        threading.Thread(target=self._accept, daemon=True).start()
+        threads.start(self._accept, "listener", again=True)
 
     def close(self) -> None:
         """Stop listening, and cut the transmission under way."""
@@ -112,7 +113,7 @@ class _Server:
         with contextlib.suppress(OSError):  # closed
             while True:
                 plain, _ = self._listener.accept()
-                threading.Thread(target=self._converse, args=(plain,), daemon=True).start()
+                threads.start(partial(self._converse, plain), "reader")
 
     @contextlib.contextmanager
     def _greeting(self, new: ssl.SSLSocket) -> Iterator[None]:

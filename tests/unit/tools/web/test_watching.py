@@ -7,9 +7,12 @@ import threading
 
 import pytest
 
+from rosrm import threads
 from rosrm.model.rows import EventRow, Listing
 from rosrm_web.gateway import Gateway
 from rosrm_web.master_link import MOST_WAITING, Busy
+from rosrm_web.tasks import serve_always
+from rosrm_web.watching import MasterState
 
 
 class Master:
@@ -136,5 +139,45 @@ def test_the_end_waits_until_the_client_has_left():
         threading.Timer(0.2, ended.set).start()
         gateway.close()
         assert left.is_set()
+
+    asyncio.run(scene())
+
+
+class Choked(Master):
+    """A client of a process that can open no further file for a while."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.left = 2
+
+    def list(self, **options):
+        """Fail twice as a library does."""
+        self.left -= 1
+        if self.left >= 0:
+            raise OSError(24, "Too many open files")
+        return super().list(**options)
+
+
+def test_the_watcher_outlives_an_error_that_is_none_of_the_masters(monkeypatch):
+    """Otherwise the page would show the last state of the master for ever."""
+    monkeypatch.setattr(threads, "FIRST_PAUSE", 0.01)
+
+    async def scene() -> None:
+        gateway = Gateway(lambda _: Choked())
+        states, up = [], asyncio.Event()
+
+        def note(master) -> None:
+            states.append(master)
+            if master.state == "up":
+                up.set()
+
+        gateway.watcher.master = MasterState("up", "")
+        gateway.watcher.on_master[:] = [lambda _: 1 / 0, note]
+        watching = serve_always(gateway.watcher.run, "watcher")
+        await asyncio.wait_for(up.wait(), 30.0)
+        watching.cancel()
+        gateway.close()
+        assert [one.state for one in states] == ["searching", "up"]
+        assert "Too many open files" in states[0].reason
 
     asyncio.run(scene())

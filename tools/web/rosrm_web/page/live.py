@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from rosrm import clocks
 from rosrm.errors import RosrmError
+from rosrm_web.tasks import serve_always
 from rosrm_web.watching import give_up_early
 
 if TYPE_CHECKING:
@@ -60,7 +61,7 @@ class Live:
         self.on_change.append(on_change)
         self._woken.set()
         if self._task is None:
-            self._task = asyncio.create_task(self._run())
+            self._task = serve_always(self._run, "live")
 
     def leave(self, on_change: Callable[[], None]) -> None:
         """End the calls of a function; without any, nothing is read."""
