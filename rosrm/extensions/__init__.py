@@ -3,6 +3,7 @@
 hookspecs.py         every hook, in one list
 contracts.py         protocols of probes, policies, filters, strategies, launchers; their offers
 sinks.py             contract of event sinks
+guarded_sink.py      calls of an event sink
 options.py           options of a process, merged over those of the cluster
 units.py             numbers with units in options
 installed.py         addresses of the installed plugins (entry points)

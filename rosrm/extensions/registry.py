@@ -46,6 +46,7 @@ from rosrm.extensions.discovery import (
     load_objects,
 )
 from rosrm.extensions.guard import Crash, guarded, limit_of_one_call, note_versions
+from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.extensions.made import (
     MadeLauncher,
@@ -232,9 +233,16 @@ class Registry:
             return None
         return cast(CheckpointPolicy, self._required("checkpoint", name, options))
 
-    def sink(self, name: str, options: Mapping[str, Any] = EMPTY) -> EventSink:
-        """Create an event sink; raises `ConfigError` or `PluginError`."""
-        return cast(EventSink, self._required("sink", name, options))
+    def sink(self, name: str, options: Mapping[str, Any] = EMPTY, shown: str = "") -> GuardedSink:
+        """Create an event sink; raises `ConfigError` or `PluginError`.
+
+        Args:
+            name: of the offer.
+            options: of the sink.
+            shown: its name for users; "": that of the offer.
+        """
+        made = cast(EventSink, self._required("sink", name, options))
+        return GuardedSink(shown or name, made)
 
     def migrations(self, chosen: NameToOptions) -> dict[str, MigrationStrategy]:
         """Create migration strategies by name, in this order; raises as `scoring` does."""

@@ -108,22 +108,14 @@ def events(  # noqa: PLR0917 - an argument for each option
 
 def _write_mcap(path: Path, rows: Iterable[EventRow]) -> None:
     """Write events to a new MCAP file, until they end or Ctrl-C."""
-    from contextlib import closing
-    from operator import methodcaller
-
-    from rosrm.extensions.guard import guarded
     from rosrm.extensions.registry import Registry
-    from rosrm.extensions.sinks import NoticesRefused
     from rosrm.model.notices import notice_of
 
     written = 0
-    with closing(Registry.discover().sink("mcap", {"file": str(path)})) as sink:
+    with Registry.discover().sink("mcap", {"file": str(path)}) as sink:
         try:
             for row in rows:
-                guarded(
-                    partial(methodcaller("send", [notice_of(row)]), sink), whom="sink 'mcap'",
-                    hook="send", lets=(NoticesRefused,),
-                )  # fmt: skip
+                sink.send([notice_of(row)])
                 written += 1
         finally:
             echo(f"{counted(written, 'event')} written to {path}", err=True)

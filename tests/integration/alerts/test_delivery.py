@@ -6,6 +6,7 @@ from contextlib import closing
 import pytest
 
 from rosrm import Notice
+from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm_alerts.delivery import Delivery
 from rosrm_alerts.outbox import Outbox, OutboxError
 from rosrm_alerts.sinks.webhook import Webhook
@@ -32,7 +33,13 @@ def outbox(tmp_path):
 
 
 def deliver(receiver: Receiver, outbox: Outbox) -> Delivery:
-    return Delivery("hook", Webhook(WebhookOptions(receiver.url)), outbox, 2, first_retry=0.01)
+    return Delivery(
+        "hook",
+        GuardedSink("hook", Webhook(WebhookOptions(receiver.url))),
+        outbox,
+        2,
+        first_retry=0.01,
+    )
 
 
 def test_a_receiver_that_fails_gets_all_notices_later(receiver, outbox):
@@ -123,7 +130,7 @@ def test_a_sink_without_its_methods_for_a_moment_gets_its_notices_later(outbox, 
     """The search for the method is a part of the call, so its failure ends no thread."""
     outbox.commit([("odd", notice(1))], 1, {})
     sink = Unconnected()
-    delivery = Delivery("odd", sink, outbox, first_retry=0.01)
+    delivery = Delivery("odd", GuardedSink("odd", sink), outbox, first_retry=0.01)
     wait_until(lambda: not outbox.waiting("odd", 1), "an empty outbox")
     delivery.close(10.0)
     assert sink.taken == [[notice(1)]]
@@ -148,7 +155,7 @@ def test_a_sink_that_hangs_is_named_once(outbox, caplog):
     """A connection without a time-out would otherwise be silent until the end."""
     outbox.commit([("odd", notice(1))], 1, {})
     sink = Hanging()
-    delivery = Delivery("odd", sink, outbox, patience=0.0)
+    delivery = Delivery("odd", GuardedSink("odd", sink), outbox, patience=0.0)
     assert sink.asked.wait(10.0)
     delivery.look()
     delivery.look()

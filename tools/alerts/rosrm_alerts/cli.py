@@ -26,8 +26,8 @@ from rosrm.wording import counted, listed
 _PATIENCE = 60.0
 
 if TYPE_CHECKING:
+    from rosrm.extensions.guarded_sink import GuardedSink
     from rosrm.extensions.registry import Registry
-    from rosrm.extensions.sinks import EventSink
     from rosrm_alerts.alerts_file import AlertsFile, ChosenSink
 
 alerts = typer.Typer(
@@ -69,10 +69,7 @@ def try_sink(
 ) -> None:
     """Send one notice to a sink, to see that it arrives."""
     from rosrm import Notice
-    from rosrm.extensions.guard import guarded
-    from rosrm.extensions.plugin_calls import titled
     from rosrm.extensions.registry import Registry
-    from rosrm.extensions.sinks import NoticesRefused
     from rosrm_alerts.alerts_file import load_alerts
 
     registry = Registry.discover()
@@ -81,11 +78,8 @@ def try_sink(
         raise ConfigError(f"{file}: no sink {sink!r}; there are: {listed(chosen) or 'none'}")
     now = clocks.wall_time()
     notice = Notice(f"try-{now:.6f}", now, "try", "`rosrm alerts try` sent this notice")
-    with closing(_made(chosen[sink], registry)) as made:
-        guarded(
-            lambda: made.send([notice]), whom=titled("sink", sink), hook="send", seconds=_PATIENCE,
-            lets=(NoticesRefused,),
-        )  # fmt: skip
+    with _made(chosen[sink], registry) as guarded:
+        guarded.send([notice], _PATIENCE)
     echo(f"the sink {sink} has taken the notice")
 
 
@@ -134,15 +128,15 @@ def run(
         ).run(stop)
 
 
-def _all_sinks(file: AlertsFile, registry: Registry) -> dict[str, tuple[EventSink, int]]:
+def _all_sinks(file: AlertsFile, registry: Registry) -> dict[str, tuple[GuardedSink, int]]:
     return {
         one.name: (_made(one, registry), getattr(registry.offer("sink", one.use), "batch", 1))
         for one in file.sinks
     }
 
 
-def _made(sink: ChosenSink, registry: Registry) -> EventSink:
-    return registry.sink(sink.use, sink.options)
+def _made(sink: ChosenSink, registry: Registry) -> GuardedSink:
+    return registry.sink(sink.use, sink.options, sink.name)
 
 
 @contextmanager

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import logging
 import threading
-from functools import partial
-from operator import methodcaller
 from typing import Final
 
 from rosrm import clocks, threads
 from rosrm.errors import PluginError
-from rosrm.extensions.guard import guarded
-from rosrm.extensions.plugin_calls import titled
-from rosrm.extensions.sinks import EventSink, NoticesRefused
+from rosrm.extensions.guarded_sink import GuardedSink
+from rosrm.extensions.sinks import NoticesRefused
 from rosrm.wording import counted, duration
 from rosrm_alerts.outbox import Outbox
 
@@ -35,7 +32,7 @@ class Delivery:
     """
 
     def __init__(
-        self, name: str, sink: EventSink, outbox: Outbox, batch: int = 1,
+        self, name: str, sink: GuardedSink, outbox: Outbox, batch: int = 1,
         first_retry: float = FIRST_RETRY, patience: float = PATIENCE,
     ) -> None:  # fmt: skip
         self._name, self._sink, self._outbox, self._batch = name, sink, outbox, batch
@@ -81,11 +78,7 @@ class Delivery:
                 retry = min(max(retry * 2.0, self._first_retry), LONGEST_RETRY)
                 _log.warning("sink %s: next attempt in %s", self._name, duration(retry))
                 self._stop.wait(retry)
-        try:
-            close = partial(methodcaller("close"), self._sink)
-            guarded(close, whom=titled("sink", self._name), hook="close")
-        except PluginError as fault:
-            _log.warning("sink %s: close failed: %s", self._name, fault)
+        self._sink.close()
 
     def _deliver(self) -> bool:
         """Deliver all that waits; return False if an attempt failed."""
@@ -93,10 +86,7 @@ class Delivery:
             notices = [one.notice for one in waiting]
             self._sending_since = clocks.boot_time()
             try:
-                guarded(
-                    partial(methodcaller("send", notices), self._sink),
-                    whom=titled("sink", self._name), hook="send", lets=(NoticesRefused,),
-                )  # fmt: skip
+                self._sink.send(notices)
             except NoticesRefused as refusal:
                 many = counted(len(waiting), "notice")
                 _log.error("sink %s: %s dropped: %s", self._name, many, refusal)

@@ -12,7 +12,6 @@ from typing import Final
 from rosrm import (
     Client,
     EventRow,
-    EventSink,
     HostRow,
     Listing,
     NoMaster,
@@ -21,6 +20,7 @@ from rosrm import (
     clocks,
 )
 from rosrm.client.event_feed import EventFeed
+from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm.model.notices import notice_of
 from rosrm_alerts.alerts_file import AlertsFile
 from rosrm_alerts.conditions import (
@@ -60,7 +60,7 @@ class AlertService:
     """
 
     def __init__(
-        self, file: AlertsFile, sinks: Mapping[str, tuple[EventSink, int]], outbox: Outbox,
+        self, file: AlertsFile, sinks: Mapping[str, tuple[GuardedSink, int]], outbox: Outbox,
         connect: Callable[[], Client],
     ) -> None:  # fmt: skip
         self._file, self._outbox, self._connect = file, outbox, connect

@@ -7,6 +7,7 @@ import threading
 from types import SimpleNamespace
 
 from rosrm import Notice, threads
+from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm_alerts.delivery import Delivery
 
 PATIENCE = 10.0
@@ -45,6 +46,6 @@ def test_a_disk_that_fails_for_a_while_ends_no_delivery(monkeypatch):
     """Otherwise the sink would get nothing any more, and nobody would be told."""
     monkeypatch.setattr(threads, "FIRST_PAUSE", 0.01)
     sink = Sink()
-    delivery = Delivery("a", sink, Outbox())
+    delivery = Delivery("a", GuardedSink("a", sink), Outbox())
     assert sink.taken.wait(PATIENCE), "the sink got no notice"
     delivery.close(PATIENCE)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm.model.rows import EventRow, Listing
 from rosrm_alerts.alerts_file import AlertsFile
 from rosrm_alerts.file_forms import Forwarded
@@ -42,7 +43,7 @@ def test_events_after_a_journal_gap_are_forwarded_once(tmp_path, number):
     outbox = Outbox(tmp_path / "outbox")
     master = Master([event(1), event(2)])
     file = AlertsFile(forwarded=(Forwarded(to=("sink",)),))
-    service = AlertService(file, {"sink": (Sink(), 1)}, outbox, lambda: master)
+    service = AlertService(file, {"sink": (GuardedSink("sink", Sink()), 1)}, outbox, lambda: master)
     service._look()
     master.events = [event(one) for one in range(1, 5)]
     service._look()
