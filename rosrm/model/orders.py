@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from rosrm.model.links import MEASURE_SECONDS, LinkPeer
-from rosrm.model.values import EMPTY, Amendment, Assignment, InstanceId, LifecycleGoal
+from rosrm.model.values import EMPTY, Amendment, Assignment, InstanceId, LifecycleGoal, Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,9 +38,14 @@ class FenceInstance:
 
 @dataclass(frozen=True, slots=True)
 class RestartInstance:
-    """Stop an instance and start it again on the same host."""
+    """Stop an instance and start it again on the same host.
+
+    Attributes:
+        run: the run that is to end: a late copy of the order changes no later one; None: any run.
+    """
 
     instance: InstanceId
+    run: Run | None = None
 
 
 #: A slave's code of the refusal of an `AmendInstance` for an instance that it knows.

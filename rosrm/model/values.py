@@ -646,6 +646,23 @@ _ENDED: Final = frozenset(
 
 
 @dataclass(frozen=True, slots=True)
+class Run:
+    """One run of an instance, from a start of its program to the next one.
+
+    Attributes:
+        pid: pid of the session leader; 0: it had not started, or had ended.
+        restarts: number of restarts by the restart policy before it.
+    """
+
+    pid: int
+    restarts: int
+
+    def is_that_of(self, pid: int, restarts: int) -> bool:
+        """Return False if a status with these values shows another run."""
+        return restarts == self.restarts and pid in (0, self.pid)
+
+
+@dataclass(frozen=True, slots=True)
 class InstanceStatus:
     """Status of one instance on its slave.
 

@@ -26,7 +26,7 @@ from rosrm.model.orders import (
     StartInstance,
     StopInstance,
 )
-from rosrm.model.values import Amendment, InstanceId, LifecycleGoal
+from rosrm.model.values import Amendment, InstanceId, LifecycleGoal, Run
 from rosrm.ros import convert
 from rosrm_msgs import srv
 
@@ -48,14 +48,6 @@ _ACTIONS: Final[Mapping[type[Order], int]] = {
     MeasureLinks: _Request.MEASURE_LINKS,
     ReloadSettings: _Request.RELOAD,
 }
-#: Orders by an instance alone.
-_OF_INSTANCE: Final[Mapping[int, Callable[[InstanceId], Order]]] = {
-    _ACTIONS[kind]: kind for kind in (StopInstance, RestartInstance, FenceInstance, DropReplica)
-}
-#: Orders without fields.
-_ALONE: Final[Mapping[int, Callable[[], Order]]] = {
-    _ACTIONS[kind]: kind for kind in (ReportInstances, ReloadSettings)
-}
 
 
 def order_to_msg(order: Order) -> srv.ControlHost.Request:
@@ -73,6 +65,8 @@ def order_to_msg(order: Order) -> srv.ControlHost.Request:
             plain = [peer_to_json(peer) for peer in peers]
             request.arguments = json.dumps({"peers": plain, "learn": learn})
             return request
+        case RestartInstance(_, Run(pid, restarts)):
+            request.arguments = json.dumps({"pid": pid, "restarts": restarts})
         case StartInstance(assignment):
             request.assignment = convert.assignment_to_msg(assignment)
         case AmendInstance(_, amendment):
@@ -110,25 +104,28 @@ def order_from_msg(request: srv.ControlHost.Request) -> Order:
     fault = _fault(request)
     if fault:
         raise Refused(fault)
-    if request.action in _ALONE:
-        return _ALONE[request.action]()
-    match request.action:
-        case _Request.START:
-            return StartInstance(convert.assignment_from_msg(request.assignment))
-        case _Request.EXECUTE:
-            arguments = convert.json_object(request.arguments, "the arguments of an executor")
-            return RunExecutor(request.executor, arguments, request.timeout)
-        case _Request.MEASURE_LINKS:
-            return _measure_links(request.arguments)
-        case _Request.AMEND:
-            return AmendInstance(instance, _amendment(request))
-        case _Request.SET_LIFECYCLE:
-            return _set_lifecycle(instance, request.lifecycle)
-        case _Request.REPLICATE:
-            return ReplicateSnapshot(instance, tuple(request.replicate_to), request.replicate_every)
-    if request.action not in _OF_INSTANCE:
+    reader = _READERS.get(request.action)
+    if reader is None:
         raise Refused(f"unknown action {request.action}")
-    return _OF_INSTANCE[request.action](instance)
+    return reader(request, instance)
+
+
+def _execute(request: srv.ControlHost.Request) -> RunExecutor:
+    arguments = convert.json_object(request.arguments, "the arguments of an executor")
+    return RunExecutor(request.executor, arguments, request.timeout)
+
+
+def _run(arguments: str) -> Run | None:
+    if not arguments:
+        return None
+    plain = convert.json_object(arguments, "the run of a restart")
+    pid, restarts = plain.get("pid"), plain.get("restarts")
+    for value in (pid, restarts):
+        if type(value) is not int or value < 0:
+            raise Refused(f"a restart of the run {arguments!r:.100}; allowed: whole numbers from 0")
+    assert isinstance(pid, int)
+    assert isinstance(restarts, int)
+    return Run(pid, restarts)
 
 
 def _amendment(request: srv.ControlHost.Request) -> Amendment:
@@ -150,6 +147,24 @@ def _measure_links(arguments: str) -> MeasureLinks:
         return MeasureLinks(peers_from_json(plain["peers"]), bool(plain["learn"]))
     except (LookupError, ValueError) as error:
         raise Refused(f"an order to measure links: {error}") from None
+
+
+_READERS: Final[Mapping[int, Callable[[srv.ControlHost.Request, InstanceId], Order]]] = {
+    _Request.STOP: lambda _, instance: StopInstance(instance),
+    _Request.FENCE: lambda _, instance: FenceInstance(instance),
+    _Request.RESTART: lambda one, instance: RestartInstance(instance, _run(one.arguments)),
+    _Request.START: lambda one, _: StartInstance(convert.assignment_from_msg(one.assignment)),
+    _Request.EXECUTE: lambda one, _: _execute(one),
+    _Request.REPORT: lambda *_: ReportInstances(),
+    _Request.RELOAD: lambda *_: ReloadSettings(),
+    _Request.AMEND: lambda one, instance: AmendInstance(instance, _amendment(one)),
+    _Request.SET_LIFECYCLE: lambda one, instance: _set_lifecycle(instance, one.lifecycle),
+    _Request.REPLICATE: lambda one, instance: ReplicateSnapshot(
+        instance, tuple(one.replicate_to), one.replicate_every
+    ),
+    _Request.DROP_REPLICA: lambda _, instance: DropReplica(instance),
+    _Request.MEASURE_LINKS: lambda one, _: _measure_links(one.arguments),
+}
 
 
 def _fault(request: srv.ControlHost.Request) -> str:

@@ -328,8 +328,9 @@ def _order_of(command: commands.SupervisorCommand) -> messages.Order:
             order = orders.StopOrdered(key_of(instance))
         case commands.Fence(instance):
             order = orders.FenceOrdered(key_of(instance))
-        case commands.Restart(instance):
-            order = orders.RestartOrdered(key_of(instance))
+        case commands.Restart(instance, run):
+            meant = None if run is None else (run.pid, run.restarts)
+            order = orders.RestartOrdered(key_of(instance), meant)
         case commands.Renew(at, alive):
             order = orders.ContactReported(at, alive)
         case commands.Fail(instance, pid, reason, kill):

@@ -34,7 +34,8 @@ The client sends orders; the key `do` names the order:
                                                 ended `after` seconds after the newest `at` (with
                                                 `alive` in the fence: after the newest of both),
                                                 by SIGKILL `grace` seconds later
-    restart      instance                       stop, then start again
+    restart      instance, run                  stop, then start again; run: [pid, restarts] of the
+                                                run that is to end, or null for any run
     fail         instance, pid, reason, kill    count this run as failed: stop it (kill: at once by
                                                 SIGKILL), then apply the restart policy
     amend        instance, restart, changes,    replace the restart policy, and apply these changes
@@ -292,6 +293,13 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
     )
 
 
+def _run(value: Sequence[Any] | None) -> tuple[int, int] | None:
+    if value is None:  # not sent by clients of an earlier version
+        return None
+    pid, restarts = value
+    return read_whole(pid, 0), read_whole(restarts, 0)
+
+
 def _read_fail(fields: Mapping[str, Any]) -> events.FailOrdered:
     key, pid = read_key(fields["instance"]), read_whole(fields["pid"])
     return events.FailOrdered(key, pid, read_text(fields["reason"]), bool(fields["kill"]))
@@ -317,7 +325,9 @@ _READERS: Final[Mapping[str, Callable[[Mapping[str, Any]], Order]]] = {
     "heard": lambda fields: events.ContactReported(
         read_amount(fields["at"]), read_amount(fields["alive"])
     ),
-    "restart": lambda fields: events.RestartOrdered(read_key(fields["instance"])),
+    "restart": lambda fields: events.RestartOrdered(
+        read_key(fields["instance"]), _run(fields.get("run"))
+    ),
     "fail": _read_fail,
     "amend": _read_amend,
     "remember": lambda fields: Remember(read_key(fields["instance"]), read_text(fields["memo"])),

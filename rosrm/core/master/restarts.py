@@ -5,7 +5,8 @@ observed                           action
 =================================  =============================================================
 a client, or the restart of a      `RestartInstance`; the run of the owner (pid, restarts) is
 dependency, restarts a process     journaled with the process
-another run is reported            the restart is done
+another run is reported            the restart is done: the stop of the run may have another
+                                   cause, after which nothing is started
 the same run is still reported     `RestartInstance` again, with back-off, while the host is up and
                                    no status of it is missing
 the run has ended before           the process is queued again
@@ -29,8 +30,8 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RestartInstance
 from rosrm.model.values import InstanceState, InstanceStatus
 
-#: Reported states that show that the slave has begun to restart the instance.
-_RESTARTS: Final = frozenset({InstanceState.STOPPING, InstanceState.STARTING})
+#: Reported ends that no fence and no host has caused.
+_ENDS: Final = frozenset({InstanceState.EXITED, InstanceState.FAILED})
 #: Conditions of a host on which a restart is given up.
 _GONE: Final = frozenset({HostCondition.LOST, HostCondition.DETACHED})
 #: Longest time, in seconds, between two orders.
@@ -51,7 +52,7 @@ def begin(
 def _order(state: MasterState, owner: Instance, pending: PendingRestart, now: float) -> None:
     period = float(state.hosts.period[owner.host.column])
     pending.backoff.note(now, max(state.settings.order_retry, _READINGS * period), _LONGEST_WAIT)
-    state.send(owner.host, RestartInstance(owner.id), Restart(owner.id))
+    state.send(owner.host, RestartInstance(owner.id, pending.run), Restart(owner.id))
 
 
 def review(state: MasterState, instance: Instance, now: float) -> None:
@@ -81,18 +82,20 @@ def note_status(state: MasterState, instance: Instance, status: InstanceStatus) 
     pending = instance.restarting
     if pending is None:
         return
-    other_pid = status.pid and status.pid != pending.pid
-    if status.state in _RESTARTS or other_pid or status.restarts != pending.restarts:
+    is_same = pending.run.is_that_of(status.pid, status.restarts)
+    if status.state is InstanceState.STARTING or not is_same:
         _end(state, instance)
 
 
 def was_missed(instance: Instance, status: InstanceStatus, now: float) -> bool:
-    """Return True if an ended run is older than the pending order to restart it.
+    """Return True if a run that no order has ended is older than the pending order to restart it.
 
     The statuses of a restart may be lost, so the end of a later run may be the first that arrives.
     """
     pending = instance.restarting
-    return pending is not None and status.run_time >= now - pending.ordered_at
+    if pending is None or status.state not in _ENDS:
+        return False
+    return status.run_time >= now - pending.ordered_at
 
 
 def note_answer(

@@ -13,6 +13,7 @@ from rosrm.model.values import (
     InstanceId,
     InstanceStatus,
     LifecycleGoal,
+    Run,
 )
 
 
@@ -60,9 +61,14 @@ class Renew:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """Order the supervisor to restart an instance."""
+    """Order the supervisor to restart an instance.
+
+    Attributes:
+        run: the run that is to end; None: any run.
+    """
 
     instance: InstanceId
+    run: Run | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from rosrm.model.values import (
     InstanceId,
     InstanceStatus,
     LifecycleGoal,
+    Run,
 )
 
 
@@ -88,9 +89,14 @@ class ContactConfirmed:
 
 @dataclass(frozen=True, slots=True)
 class RestartOrdered:
-    """The master ordered to restart an instance on this host."""
+    """The master ordered to restart an instance on this host.
+
+    Attributes:
+        run: the run that is to end; None: any run.
+    """
 
     instance: InstanceId
+    run: Run | None = None
 
 
 @dataclass(frozen=True, slots=True)

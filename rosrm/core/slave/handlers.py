@@ -247,8 +247,10 @@ def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float
         return [] if held is None else [commands.Report((held.status,))]
     if event.instance in state.waiting:
         return []  # the start itself still waits
-    held.ready_by, held.unready = None, ""
-    return [commands.Restart(event.instance)]
+    if event.run is not None and not event.run.is_that_of(held.status.pid, held.status.restarts):
+        return [commands.Report((held.status,))]  # a late copy: its run has ended
+    held.ready_by = None
+    return [commands.Restart(event.instance, event.run)]
 
 
 def _amendment_ordered(state: SlaveState, event: events.AmendmentOrdered, now: float) -> _Commands:
@@ -403,6 +405,7 @@ def _note_begin(held: HeldInstance, reported: InstanceStatus, now: float) -> Non
 def _running(held: HeldInstance, reported: InstanceStatus, now: float) -> InstanceStatus:
     """Return the status of a new run: ready at once, or after its node appears in the graph."""
     held.steering = held.loading = None
+    held.unready = ""  # the order to stop it may be lost
     awaited = held.awaited
     if awaited is not None and awaited.seen == FIRST_RUN:
         first = reported.pid if reported.restarts == 0 else 0
@@ -527,6 +530,7 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
             unseen = f"{node} of this instance was seen in the ROS graph"
             why = components.lateness(held) or unseen
             held.unready = f"not ready within {awaited.timeout:g} s: {why}"
+            held.loading = None  # because an instance that is being stopped becomes ready no more
             orders.append(commands.Stop(instance))
         elif held.loading is not None:
             orders += _after(state, held, components.time_passed(held, now), now)

@@ -18,8 +18,8 @@ def event_of(order: orders.InstanceOrder, given_at: float | None = None) -> even
             return events.StopOrdered(instance)
         case orders.FenceInstance(instance):
             return events.FenceOrdered(instance)
-        case orders.RestartInstance(instance):
-            return events.RestartOrdered(instance)
+        case orders.RestartInstance(instance, run):
+            return events.RestartOrdered(instance, run)
         case orders.AmendInstance(instance, amendment):
             return events.AmendmentOrdered(instance, amendment)
         case orders.SetLifecycleState(instance, state):

@@ -51,9 +51,15 @@ class ContactReported(NamedTuple):
 
 
 class RestartOrdered(NamedTuple):
-    """The client ordered a restart of the instance."""
+    """The client ordered a restart of the instance.
+
+    Attributes:
+        run: pid (0: none) and number of restarts of the run that is to end; another run is not
+            changed; None: any run.
+    """
 
     instance: Key
+    run: tuple[int, int] | None = None
 
 
 class AmendOrdered(NamedTuple):

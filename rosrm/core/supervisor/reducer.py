@@ -62,6 +62,9 @@ order.
 
 `ClientLost` changes nothing: each instance runs on as long as its fence allows.
 
+An order to restart one run (pid and number of restarts) changes no other run of the instance, so a
+late copy of the order restarts nothing.
+
 An event that is not in the table changes nothing. An order that changes nothing repeats the report
 of the status, because DDS may repeat the order. Every change of an instance is reported
 (`ReportStatus`). A signal goes to every remaining process of an instance, and never after its end.

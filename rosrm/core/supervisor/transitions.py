@@ -118,6 +118,20 @@ def _stop(instance: Instance, event: events.Event, now: float) -> list[Command]:
     return _begin_stop(instance, THEN_END, now)
 
 
+def _of_its_run(transition: Transition) -> Transition:
+    """Return a transition of an order to restart that changes nothing if its run has ended."""
+
+    def guarded(instance: Instance, event: events.Event, now: float) -> list[Command]:
+        assert isinstance(event, events.RestartOrdered)
+        if event.run is not None:
+            pid, restarts = event.run
+            if restarts != instance.restarts or instance.pid not in (0, pid):
+                return []
+        return transition(instance, event, now)
+
+    return guarded
+
+
 def _restart(instance: Instance, event: events.Event, now: float) -> list[Command]:
     return _begin_stop(instance, THEN_RESTART, now)
 
@@ -250,7 +264,7 @@ TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
     (RUNNING, events.StopOrdered): _stop,
     (RUNNING, events.FencePassed): _fence,
     (RUNNING, events.FenceOrdered): _fence,
-    (RUNNING, events.RestartOrdered): _restart,
+    (RUNNING, events.RestartOrdered): _of_its_run(_restart),
     (RUNNING, events.AmendOrdered): _amend,
     (RUNNING, events.FailOrdered): _fail,
     (STOPPING, events.TimePassed): _escalate,
@@ -259,10 +273,10 @@ TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
     (STOPPING, events.StopOrdered): _mean_to_end,
     (STOPPING, events.FencePassed): _fence_while_it_stops,
     (STOPPING, events.FenceOrdered): _fence_while_it_stops,
-    (STOPPING, events.RestartOrdered): _mean_to_restart,
+    (STOPPING, events.RestartOrdered): _of_its_run(_mean_to_restart),
     (STOPPING, events.AmendOrdered): _amend,
     (BACKOFF, events.TimePassed): _restart_due,
-    (BACKOFF, events.RestartOrdered): _restart_now,
+    (BACKOFF, events.RestartOrdered): _of_its_run(_restart_now),
     (BACKOFF, events.StopOrdered): _stop_in_backoff,
     (BACKOFF, events.FencePassed): _fence_in_backoff,
     (BACKOFF, events.FenceOrdered): _fence_in_backoff,

@@ -514,6 +514,11 @@ class Cluster(World[Machine]):
             if instance.process == name
         ]
 
+    def runs(self, name: str) -> int:
+        """Return the number of starts in place of the newest instance, after its first one."""
+        programs = {i: it for one in self.machines.values() for i, it in one.programs.items()}
+        return programs[max(one for one in programs if one.process == name)].run
+
     def node(self, host: str, name: str = "p") -> Node:
         """Return the newest node of a process on a host."""
         machine = self.machines[host]

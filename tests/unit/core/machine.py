@@ -147,7 +147,7 @@ class Machine(Host[Program]):
         instance = self.find(name)
         program = self.programs[instance]
         if program.restart.when == "always" or (program.restart.when == "on-failure" and code):
-            self._restart(instance, now)
+            self._restart(instance, now, by_policy=True)
             return
         program.run_time = run_time
         state = InstanceState.EXITED if code == 0 else InstanceState.FAILED
@@ -236,7 +236,7 @@ class Machine(Host[Program]):
 
     def _running(self) -> list[InstanceStatus]:
         return [
-            InstanceStatus(instance, program.state, pid=program.pid)
+            InstanceStatus(instance, program.state, pid=program.pid, restarts=program.restarts)
             for instance, program in self.programs.items()
         ]
 

@@ -34,6 +34,7 @@ from rosrm.model.values import (
     Limits,
     ProcessSpec,
     RestartPolicy,
+    Run,
 )
 from rosrm.ros.orders import journal_of, order_from_msg, order_to_msg, start_to_msg
 from rosrm_msgs import srv
@@ -47,6 +48,7 @@ EVENTS = [
     (StopInstance(ONE), happened.StopOrdered(ONE)),
     (FenceInstance(ONE), happened.FenceOrdered(ONE)),
     (RestartInstance(ONE), happened.RestartOrdered(ONE)),
+    (RestartInstance(ONE, Run(5, 2)), happened.RestartOrdered(ONE, Run(5, 2))),
     (AmendInstance(ONE, POLICY), happened.AmendmentOrdered(ONE, POLICY)),
     (AmendInstance(ONE, LIMITED), happened.AmendmentOrdered(ONE, LIMITED)),
     (SetLifecycleState(ONE, "inactive"), happened.LifecycleOrdered(ONE, "inactive")),
@@ -105,6 +107,13 @@ def test_a_start_has_the_watermark_of_the_journal():
 def test_an_invalid_watermark_is_refused(arguments):
     with pytest.raises(Refused):
         journal_of(srv.ControlHost.Request(arguments=arguments))
+
+
+@pytest.mark.parametrize("run", ['{"pid": 5}', '{"pid": -1, "restarts": 0}', "[5, 0]", "{"])
+def test_a_restart_of_an_impossible_run_is_refused(run):
+    action = srv.ControlHost.Request.RESTART
+    with pytest.raises(Refused):
+        order_from_msg(srv.ControlHost.Request(action=action, arguments=run))
 
 
 def test_an_unknown_action_is_refused():

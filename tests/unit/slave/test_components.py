@@ -119,6 +119,14 @@ def test_the_readiness_time_out_ends_a_container_and_names_the_component() -> No
     assert slave.of("c").status.message == said
 
 
+def test_a_container_that_is_being_stopped_becomes_ready_no_more() -> None:
+    """The answer of the load comes after the time-out."""
+    slave = seen()
+    listed(slave)
+    assert slave.step(TimePassed(), 10.0) == [Stop(C)]
+    assert loaded(slave, CAMERA) == []
+
+
 def test_the_next_run_gets_all_components_again() -> None:
     """Also from a slave that knows the container only by the memo of a former run."""
     slave = seen()

@@ -50,6 +50,7 @@ from rosrm.model.values import (
     ProcessSpec,
     Readiness,
     RestartPolicy,
+    Run,
 )
 from rosrm.slave.memos import from_memo, to_memo
 from tests.unit.slave.rig import PLAIN, Slave, assignment, launched, states
@@ -229,6 +230,14 @@ def test_stop_and_restart_go_to_the_supervisor(running) -> None:
     assert running.step(RestartOrdered(InstanceId("q", 2))) == []
 
 
+def test_a_late_order_to_restart_a_former_run_changes_nothing(running) -> None:
+    """The slave answers with the status, which shows the present run."""
+    running.status(STATE.RUNNING, pid=6)
+    assert states(running.step(RestartOrdered(ONE, Run(5, 0)))) == [STATE.READY]
+    meant = Run(6, 0)
+    assert running.step(RestartOrdered(ONE, meant)) == [slave_commands.Restart(ONE, meant)]
+
+
 # --- readiness --------------------------------------------------------------------------------
 
 
@@ -273,6 +282,14 @@ def test_an_instance_that_does_not_become_ready_is_stopped_and_has_failed(node) 
     assert states([report]) == [STATE.FAILED]
     assert "not ready within 10 s" in report.statuses[0].message
     assert "/robot/n" in report.statuses[0].message
+
+
+def test_a_run_that_is_ready_after_all_does_not_fail_for_its_late_readiness(node) -> None:
+    """The supervisor was killed before it got the order to stop the node."""
+    node.step(TimePassed(), after=10.1)
+    node.step(replaced(InstanceStatus(NODE_1, STATE.RUNNING, pid=5)))
+    assert states(node.step(SeenInGraph(NODE_1))) == [STATE.READY]
+    assert states(node.status(STATE.EXITED, "n")) == [STATE.EXITED]
 
 
 def test_each_run_has_its_own_time_to_become_ready(node) -> None:

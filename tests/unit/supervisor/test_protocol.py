@@ -78,7 +78,7 @@ ORDERS = st.one_of(
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),
     st.builds(ContactReported, SECONDS, SECONDS),
-    st.builds(RestartOrdered, KEYS),
+    st.builds(RestartOrdered, KEYS, st.none() | st.tuples(st.integers(0, 99), st.integers(0, 99))),
     st.builds(FailOrdered, KEYS, st.integers(1, 2**31), st.text(), st.booleans()),
     st.builds(messages.Amend, KEYS, RULES, CHANGES, st.none() | RUN_LIMITS),
     st.builds(messages.Remember, KEYS, st.text()),

@@ -290,6 +290,15 @@ def test_forced_restart_stops_then_starts():
     assert instance.restarts == 0
 
 
+@pytest.mark.parametrize("run", [(99, 0), (100, 1), (0, 0)])
+def test_a_restart_of_another_run_changes_nothing(run):
+    """A late copy of an order, after the restart that it ordered: the status is reported again."""
+    core, instance = started()
+    assert kinds(core.handle(RestartOrdered(TALKER, run), 1.0)) == ["ReportStatus"]
+    assert instance.phase == RUNNING
+    assert kinds(core.handle(RestartOrdered(TALKER, (100, 0)), 1.0)) == ["ReportStatus", "Signal"]
+
+
 def test_a_restart_while_its_own_end_is_in_hand_is_carried_out():
     """The leader has ended, and leftovers are being stopped: then the instance restarts."""
     core, instance = started()

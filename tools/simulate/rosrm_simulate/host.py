@@ -60,7 +60,9 @@ class Program:
     Attributes:
         restart: restart policy that the supervisor applies when the instance ends.
         limits: as last changed while it runs.
-        run: number of its restarts; a delayed action for an earlier run has no effect.
+        run: number of its starts after the first one; a delayed action for an earlier run has no
+            effect.
+        restarts: number of those that its restart policy caused.
         lifecycle_state: state of its node, if that is a lifecycle node.
     """
 
@@ -70,6 +72,7 @@ class Program:
     limits: Limits = field(default_factory=Limits)
     state: InstanceState = InstanceState.STARTING
     run: int = 0
+    restarts: int = 0
     lifecycle_state: str = "unconfigured"
 
 
@@ -282,8 +285,11 @@ class Host(ABC, Generic[ProgramT]):
                 self._stop(instance, now)
             case commands.Fence(instance):
                 self._fence(instance, now)
-            case commands.Restart(instance):
-                self._restart(instance, now)
+            case commands.Restart(instance, run):
+                there = self.programs[instance]
+                is_meant = run is None or run.is_that_of(there.pid, there.restarts)
+                if is_meant and there.state is InstanceState.RUNNING:
+                    self._restart(instance, now)
             case commands.Amend(instance, amendment):
                 program = self.programs.get(instance)  # None: its start has the amendment
                 refusal = "" if program is None else self._amend(program, amendment)
@@ -372,21 +378,26 @@ class Host(ABC, Generic[ProgramT]):
             return
         program.state = InstanceState.RUNNING
         self.run_begins(program, now)
-        status = InstanceStatus(instance, InstanceState.RUNNING, pid=program.pid, restarts=run)
+        status = InstanceStatus(
+            instance, InstanceState.RUNNING, pid=program.pid, restarts=program.restarts
+        )
         self._supervisor_says(status, now)
 
-    def _restart(self, instance: InstanceId, now: float) -> None:
+    def _restart(self, instance: InstanceId, now: float, *, by_policy: bool = False) -> None:
         program = self.programs[instance]
         if program.state is InstanceState.STOPPING:
             return  # an order to stop prevails
+        former = InstanceStatus(
+            instance, InstanceState.STOPPING, pid=program.pid, restarts=program.restarts
+        )
+        program.restarts += by_policy
         program.state = InstanceState.STARTING
         # With the former pid, the slave would report a node as ready before it is in the graph.
         program.pid = self.next_pid()
         program.run += 1
         program.lifecycle_state = "unconfigured"
         self.run_begins_again(program, now)
-        status = InstanceStatus(instance, InstanceState.STOPPING, restarts=program.run)
-        self._supervisor_says(status, now)
+        self._supervisor_says(former, now)
         seconds = self.stop_time + self.start_time
         self.later(seconds, now, partial(self._started, instance, program.run))
 
@@ -395,7 +406,9 @@ class Host(ABC, Generic[ProgramT]):
         if program is None or program.state is InstanceState.STOPPING:
             return
         program.state = InstanceState.STOPPING
-        status = InstanceStatus(instance, InstanceState.STOPPING, pid=program.pid)
+        status = InstanceStatus(
+            instance, InstanceState.STOPPING, pid=program.pid, restarts=program.restarts
+        )
         self._supervisor_says(status, now)
         self.later(self.stop_time, now, partial(self._stopped, instance))
 
@@ -412,10 +425,12 @@ class Host(ABC, Generic[ProgramT]):
         signal: int = 0,
     ) -> None:  # fmt: skip
         run_time, peak_memory, cpu_time = self.spent(self.programs[instance], now)
+        restarts = self.programs[instance].restarts
         del self.programs[instance]
         self.run_ended(now)
         status = InstanceStatus(
             instance, state, exit_code=code, exit_signal=signal, run_time=run_time,
+            restarts=restarts,
             peak_memory=peak_memory, cpu_time=cpu_time,
             message=f"exit code {code}" if code else "",
         )  # fmt: skip

@@ -16,7 +16,7 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import Plain
-from rosrm.model.values import GroupEnd, InstanceId, InstanceState, Kind, ProcessSpec
+from rosrm.model.values import GroupEnd, InstanceId, InstanceState, Kind, ProcessSpec, Run
 
 #: Principal and name of a gang.
 GangKey = tuple[str, str]
@@ -85,6 +85,11 @@ class PendingRestart:
     follows: bool
     ordered_at: float = -inf
     backoff: Backoff = field(default_factory=Backoff)
+
+    @property
+    def run(self) -> Run:
+        """Return the run that is to end."""
+        return Run(self.pid, self.restarts)
 
 
 #: Fields of a pending restart that are journaled.
