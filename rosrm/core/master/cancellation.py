@@ -55,14 +55,18 @@ def cancel(
     state.save(process)
 
 
-def kill(state: MasterState, process: Process, now: float) -> None:
+def kill(state: MasterState, process: Process, now: float, by: Requester) -> None:
     """Order the slaves to kill every instance of a cancelled process (SIGKILL).
 
     Neither the graces of its `stop` nor dependants or a migration delay the end.
     """
     state.start_orders.last_to_stop.pop(process.name, None)
+    if not process.killed and not process.phase.is_terminal:
+        message = f"the cancellation of {process.name} is by force: its instances are killed"
+        state.record(now, EventKind.CANCEL_REQUESTED, message, process=process.name, by=by)
+        process.killed = True
+        state.save(process)
     for instance in state.instances_of(process):
-        instance.at_once = True
         lifecycle.stop_instance(state, instance, now)
 
 

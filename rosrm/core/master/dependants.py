@@ -49,7 +49,7 @@ def binding_dependants(state: MasterState, process: Process) -> list[str]:
 
 def awaited_ends(state: MasterState, process: Process) -> list[str]:
     """Return the names of the processes that must end before a cancelled process is stopped."""
-    if process.wanted is not DesiredState.CANCEL:
+    if process.wanted is not DesiredState.CANCEL or process.killed:
         return []
     dependants = binding_dependants(state, process)
     return [name for name in dependants if state.processes[name].wanted is DesiredState.CANCEL]

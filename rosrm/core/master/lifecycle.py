@@ -333,7 +333,10 @@ def stop_owner(state: MasterState, process: Process, owner: Instance, now: float
 def stop_instance(state: MasterState, instance: Instance, now: float) -> None:
     """Order an instance to stop for good; `tick` repeats the order until the instance has ended."""
     instance.stopping = True
-    order: Order = FenceInstance(instance.id) if instance.at_once else StopInstance(instance.id)
+    process = state.processes.get(instance.id.process)
+    is_killed = process is not None and process.killed
+    at_once = instance.at_once or (is_killed and not instance.stray)
+    order: Order = FenceInstance(instance.id) if at_once else StopInstance(instance.id)
     state.send(instance.host, order)
     instance.order_at = now
 

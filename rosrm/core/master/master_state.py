@@ -334,7 +334,7 @@ class MasterState:
         self, process: Process, end: ProcessPhase, reason: str
     ) -> tuple[ProcessPhase, str]:
         """Return phase and reason of a process between two runs of its schedule."""
-        process.wanted, process.overdue = DesiredState.RUN, False
+        process.wanted, process.overdue, process.killed = DesiredState.RUN, False, False
         if not process.next_run:  # its first run has not started
             process.next_run = process.spec.schedule.next_run(self.wall)
         details = f": {reason}" if reason else ""
@@ -469,6 +469,7 @@ class MasterState:
             process.next_spec = None
         process.owner, process.ended_on = 0, ""
         process.wanted, process.overdue, process.cancel_cause = DesiredState.RUN, False, ""
+        process.killed = False
         process.started_at, process.began = inf, 0.0
         if process.left_behind is None:
             process.ran_before = 0.0

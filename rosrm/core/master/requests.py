@@ -308,7 +308,7 @@ def cancel_requested(state: MasterState, event: happened.CancelRequested, now: f
         if not process.phase.is_terminal and not (event.at_once and _is_cancelled(process)):
             cancel(state, process, now, by=event.by)
         if event.at_once:
-            kill(state, process, now)
+            kill(state, process, now, event.by)
     state.emit(Reply(event.request, message=_cancelled(state, processes, terminal)))
 
 

@@ -69,6 +69,43 @@ def test_a_kill_is_repeated_as_a_kill() -> None:
     assert len(cluster.orders(StopInstance)) <= 1  # of the cancellation
 
 
+def test_a_kill_is_a_kill_after_a_restart_of_the_master() -> None:
+    """The next master does not grant the graces of the stop either."""
+    cluster = stubborn(process("p"))
+    cluster.cut("a")
+    kill(cluster, "p")
+    cluster.restart_master()
+    cluster.carried.clear()
+    cluster.rejoin("a", seconds=3.0)
+    assert cluster.orders(FenceInstance)
+    assert not cluster.orders(StopInstance)
+
+
+def test_a_kill_does_not_wait_for_dependants_after_a_restart_of_the_master() -> None:
+    """The dependant is being stopped, and takes its time."""
+    after = process("after", start_order=StartOrder(after={"p": "ready"}))
+    cluster = stubborn(process("p"), after)
+    cluster.wait(1.0)
+    cluster.cancel("after", "p")
+    cluster.cut("a")
+    kill(cluster, "p")
+    cluster.restart_master()
+    cluster.rejoin("a", seconds=3.0)
+    assert "p" not in cluster.state.start_orders.last_to_stop
+    assert cluster.where("p") == []
+
+
+def test_a_process_that_is_restarted_after_a_kill_is_stopped_with_its_graces() -> None:
+    """Only the cancellation was by force."""
+    cluster = Cluster("a").with_processes(process("p"))
+    kill(cluster, "p")
+    cluster.settle()
+    cluster.restart("p")
+    cluster.wait(1.0)
+    cluster.cancel("p")
+    assert len(cluster.orders(StopInstance)) == 2  # the first one of the first cancellation
+
+
 def test_a_kill_does_not_wait_for_dependants() -> None:
     """A cancelled process is killed while the one that starts after it is being stopped."""
     after = process("after", start_order=StartOrder(after={"p": "ready"}))

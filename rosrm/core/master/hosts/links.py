@@ -9,7 +9,7 @@ the slave has answered          the report replaces what was known of the host; 
                                 entries are left out and recorded; a flow that is not
                                 reported for `LEARNED_FOR` stops counting
 no answer in time               the order is repeated after `link_period`
-the slave refuses the order     the host is asked again when it registers
+the slave refuses the order     the order is repeated, with back-off
 ==============================  =============================================================
 
 Nothing is persisted: slaves measure again.
@@ -66,8 +66,9 @@ def note_answer(state: MasterState, name: str, event: happened.OrderAnswered, no
         return
     if not event.accepted:
         if event.outcome is not OrderOutcome.TIMEOUT:
-            state.link_queries.remove(name)
+            state.link_queries.note_refusal(name, now, state.settings.link_period)
         return
+    state.link_queries.note_success(name)
     try:
         report, faults = report_from_json(event.result or EMPTY)
     except ValueError as fault:

@@ -4,6 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from math import inf
+from typing import Final
+
+from rosrm.core.master.state.backoff import Backoff
+
+#: Longest time, in seconds, until a host that refuses to measure is asked again.
+_LONGEST_WAIT: Final = 600.0
 
 
 class LinkQueries:
@@ -19,6 +25,7 @@ class LinkQueries:
         self.probed_at = -inf
         self._due: dict[str, float] = {}
         self._turns: dict[str, int] = {}
+        self._refusals: dict[str, Backoff] = {}
 
     def begin(self, host: str, now: float) -> None:
         """Let a host measure its links from now on; the address of its former slave is void."""
@@ -32,15 +39,23 @@ class LinkQueries:
 
     def remove(self, host: str) -> None:
         """Ask a host no more, and forget its address."""
-        self._due.pop(host, None)
-        self.places.pop(host, None)
+        for table in (self._due, self.places, self._refusals):
+            table.pop(host, None)
+
+    def note_refusal(self, host: str, now: float, period: float) -> None:
+        """Ask a host that has refused to measure again later, with back-off."""
+        wait = self._refusals.setdefault(host, Backoff()).note(now, period, _LONGEST_WAIT)
+        self.add(host, now + wait)
+
+    def note_success(self, host: str) -> None:
+        """Forget the refusals of a host that measures."""
+        self._refusals.pop(host, None)
 
     def take_due(self, now: float) -> str | None:
         """Remove and return the first host whose measurement is due; None: there is none."""
-        host = next(iter(self._due), None)
-        if host is None or self._due[host] > now:
-            return None
-        del self._due[host]
+        host = next((one for one, at in self._due.items() if at <= now), None)
+        if host is not None:
+            del self._due[host]
         return host
 
     def peers(self, host: str, most: int) -> Iterator[str]:

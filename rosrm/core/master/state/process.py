@@ -241,7 +241,7 @@ class Failure:
 JOURNALED: Final = (
     "order", "wanted", "owner", "reason", "excluded", "migrations", "exit_code", "restarts", "born",
     "principal", "owned_from", "defaulted", "began", "overdue", "reschedules", "queue_delay",
-    "failed_on", "next_run", "restart_due", "cancel_cause", "awaits_gang", "by_operator",
+    "failed_on", "next_run", "restart_due", "cancel_cause", "awaits_gang", "by_operator", "killed",
 )  # fmt: skip
 
 
@@ -289,6 +289,8 @@ class Process:
             master or a lost host left it.
         overdue: True: its time limit has passed, and it is being stopped.
         cancel_cause: why it is, or was, cancelled without a request of a client; "": it was not.
+        killed: True: its cancellation is by force: neither the graces of its `stop` nor other
+            processes delay the end.
         awaits_gang: True: it has a gang, and has not started since it was submitted; so it is
             placed together with the others of which this is true.
         reschedules: number of times that it was queued again after it had failed, in a row.
@@ -340,6 +342,7 @@ class Process:
     ran_before: float = 0.0
     overdue: bool = False
     cancel_cause: str = ""
+    killed: bool = False
     awaits_gang: bool = False
     reschedules: int = 0
     queue_delay: float = 0.0
