@@ -400,6 +400,18 @@ def test_a_stateful_process_waits_for_room_and_a_stateless_one_is_stopped_first(
     assert "no host has room for the new version of p beside the old" in task.reason
 
 
+def test_a_degraded_application_is_not_recorded_as_applied() -> None:
+    """One process has failed for good when the work on the other one ends."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p", restart=RestartPolicy("never")), process("q"))
+    cluster.finish("p", code=1)
+    cluster.wait(5.0)
+    assert row(cluster).state == "degraded"
+    assert cluster.recorded("application_applied") == []
+    said = "nav is degraded at version 1: p has failed: exit code 1"
+    assert cluster.recorded("application_failed")[-1] == said
+
+
 def test_a_finished_service_is_not_as_desired() -> None:
     """The application is degraded, and the next apply starts the service again; a job is done."""
     cluster = Cluster("a")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final
 
 from rosrm.core.master.applications.difference import difference_of
@@ -22,28 +23,37 @@ def application_rows(state: MasterState) -> list[ApplicationRow]:
 
 
 def _row(state: MasterState, application: Application) -> ApplicationRow:
-    unwell = {
-        name: why for name in application.specs if (why := _why_unwell(state, application, name))
-    }
+    unwell = unwell_processes(state, application)
     tasks = {name: task.fault or task.reason for name, task in application.tasks.items()}
     pending = unknown_processes(state, application) | tasks
     condition = _condition(application, pending, unwell)
-    first = [f"{name} {why}" for name, why in unwell.items()]
     return ApplicationRow(
         application.name, application.principal, condition, application.wanted,
         len(application.specs), len(application.specs) - len(unwell), pending,
-        _reason(state, application, condition, first),
+        _reason(state, application, condition, unwell),
         tuple(_version_row(application, one) for one in application.versions.values()),
     )  # fmt: skip
 
 
+def unwell_processes(state: MasterState, application: Application) -> dict[str, str]:
+    """Return the processes that are not as the application desires, each with a predicate."""
+    found = ((name, _why_unwell(state, application, name)) for name in application.specs)
+    return {name: why for name, why in found if why}
+
+
+def described(unwell: Mapping[str, str]) -> str:
+    """Return a phrase on the first processes that are not as desired."""
+    return "; ".join(few([f"{name} {why}" for name, why in unwell.items()]))
+
+
 def _reason(
-    state: MasterState, application: Application, condition: ApplicationState, unwell: list[str]
-) -> str:
+    state: MasterState, application: Application, condition: ApplicationState,
+    unwell: Mapping[str, str],
+) -> str:  # fmt: skip
     """Return why an application is not as desired, or which mode has it although cancelled."""
     mode = state.modes.mode
     if condition == "degraded":
-        return "; ".join(few(unwell))
+        return described(unwell)
     if condition == "cancelled" and mode is not None and application.name in mode.applications:
         return f"the mode {mode.name} has it: `rosrm mode {mode.name}` applies it again"
     return application.paused

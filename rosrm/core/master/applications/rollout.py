@@ -33,6 +33,7 @@ from rosrm.core.master.applications.deadlines import (
     note_wait,
 )
 from rosrm.core.master.applications.difference import differences, with_changes_in_place
+from rosrm.core.master.applications.listing import described, unwell_processes
 from rosrm.core.master.applications.replacement import Busy, NeverFits, try_replace
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.cancellation import cancel
@@ -368,11 +369,16 @@ def _set_wanted(
 
 
 def _note_end(state: MasterState, application: Application, now: float) -> None:
-    """Record that an application is as desired, or is cancelled."""
+    """Record that the work on an application is done: it is as desired, degraded or cancelled."""
     version = application.version
     application.returning, application.former = False, 0
     if version is None:
         _note(state, application, now, EventKind.APPLICATION_CANCELLED, "is cancelled")
+        return
+    unwell = unwell_processes(state, application)
+    if unwell:
+        message = f"is degraded at version {version.number}: {described(unwell)}"
+        _note(state, application, now, EventKind.APPLICATION_FAILED, message)
         return
     processes = counted(len(version.specs), "process", "processes")
     message = f"is at version {version.number} with {processes}"
