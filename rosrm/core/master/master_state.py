@@ -301,6 +301,7 @@ class MasterState:
         self.reports_awaited.pop(host.column, None)
         self.missing_since.pop(host.column, None)
         self.hosts.set_report_due(host, report_due=False)
+        host.unreached = False
 
     # --- processes -----------------------------------------------------------------------
 

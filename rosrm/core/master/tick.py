@@ -17,7 +17,7 @@ from rosrm.core.master.hosts import capabilities, links
 from rosrm.core.master.hosts.liveness import review_liveness
 from rosrm.core.master.hosts.loss import review_lost_hosts
 from rosrm.core.master.hosts.registration import review_departures
-from rosrm.core.master.lifecycle import stop_instance
+from rosrm.core.master.lifecycle import gone, stop_instance
 from rosrm.core.master.master_state import REPORT_WAITS, MasterState
 from rosrm.core.master.migration.eviction import evict_from_hosts
 from rosrm.core.master.migration.preemption import preempt
@@ -90,6 +90,8 @@ def _review_instance(state: MasterState, instance: Instance, now: float) -> None
         stop_instance(state, instance, now)
     restarts.review(state, instance, now)
     review_reservation(state, instance, now)
+    if _never_arrived(state, instance, age):
+        _give_up(state, instance, age, now)
 
 
 def _review_delivery(state: MasterState, instance: Instance, age: float, now: float) -> None:
@@ -127,6 +129,35 @@ def _withdraw(state: MasterState, process: Process, instance: Instance, now: flo
         state.save(process)
     instance.order_at = now
     state.emit(Withdraw(state.pending_orders.add(), instance.host.host_id, instance.id))
+
+
+def _never_arrived(state: MasterState, instance: Instance, age: float) -> bool:
+    """Return True if an instance does not exist, because its host reports without it for so long.
+
+    A slave refuses an assignment that is older than `control.max_age`. A host that is silent, or of
+    which a status is missing, may have the instance.
+    """
+    host = instance.host
+    if instance.state is not None or age < state.settings.delivery_timeout + state.settings.lease:
+        return False
+    if instance.id.process in state.migrations or instance.id.process in state.standbys:
+        return False  # their plans have their own time-outs
+    if state.hosts.condition_of(host) is not HostCondition.UP:
+        return False
+    return host.unreached or host.column not in (
+        *state.reports_awaited,
+        *map(int, state.hosts.statuses_missing()),
+    )
+
+
+def _give_up(state: MasterState, instance: Instance, age: float, now: float) -> None:
+    """Drop an instance that never arrived; its host gets no work until it answers an order."""
+    host = instance.host
+    if not host.unreached:
+        host.unreached = True
+        state.hosts.set_report_due(host, report_due=True)
+        state.ask_for_report(host, now)
+    gone(state, instance, now, f"{host.name} did not answer within {age:.0f} s")
 
 
 def _ask_for_missing_statuses(state: MasterState, now: float) -> None:

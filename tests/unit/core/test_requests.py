@@ -479,6 +479,40 @@ def test_an_assignment_whose_answer_is_lost_is_stopped_before_the_next() -> None
     assert not cluster["p"].excluded
 
 
+def wait_one_way(cluster: Cluster, host: str, seconds: float) -> None:
+    """Let time pass in which all messages of a host arrive, and none to it."""
+    machine = cluster.machines[host]
+    machine.connected = False
+    for _ in range(round(seconds / 0.1)):
+        cluster.wait(0.1)
+        cluster.tell(cluster.readings([machine]))
+        machine.ordered.clear()
+        machine.polled.clear()
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+def test_an_assignment_to_a_host_that_only_sends_ends(cancelled: bool) -> None:
+    """The process is placed elsewhere, and the host gets no work until it answers."""
+    cluster = Cluster("a", Machine("b", busy={"memory": 0.5}), delivery_timeout=5.0, lease=10.0)
+    cluster.machines["a"].connected = False
+    cluster.submit(process("p"))
+    assert cluster.phase("p") == "assigned"
+    if cancelled:
+        cluster.cancel("p")
+    wait_one_way(cluster, "a", 14.0)
+    assert cluster.where("p") == []
+    wait_one_way(cluster, "a", 2.0)
+    found = cluster.phase("p"), cluster.where("p")
+    assert found == (("cancelled", []) if cancelled else ("running", ["b"]))
+    cluster.submit(process("q"))
+    wait_one_way(cluster, "a", 1.0)
+    assert cluster.where("q") == ["b"]
+    cluster.reconnect("a", seconds=60.0)
+    cluster.submit(process("r"))
+    cluster.wait(1.0)
+    assert cluster.where("r") == ["a"]
+
+
 def test_an_instance_that_appears_after_its_withdrawal_is_stopped() -> None:
     """The late instance is stopped first, so that two are never active."""
     cluster = Cluster("a", delivery_timeout=5.0)

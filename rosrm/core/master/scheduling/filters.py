@@ -266,8 +266,9 @@ def _has_reported(hosts: Candidates) -> BoolArray:
     return ~hosts.table.report_due[hosts.columns]
 
 
-def _why_not_reported(_hosts: Candidates, _row: int) -> str:
-    return "it was lost, and has not reported its processes yet"
+def _why_not_reported(hosts: Candidates, row: int) -> str:
+    was = "did not answer an assignment" if hosts.host(row).unreached else "was lost"
+    return f"it {was}, and has not reported its processes yet"
 
 
 def _has_asked(hosts: Candidates) -> BoolArray:

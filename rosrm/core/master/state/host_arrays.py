@@ -45,7 +45,8 @@ class HostColumns:
         asking: (H,) the host has requested work since its registration.
         accepting: (H,) the host is under all its limits, by its newest reading.
         closed: (H,) cordoned or draining.
-        report_due: (H,) the host was lost, and has not reported its instances since.
+        report_due: (H,) the host was lost or did not answer an assignment, and has not reported
+            its instances since.
         stale: (H,) bit i: the reading of slot i, which has a limit, is stale.
         last_contact: (H,) time of the newest message.
         read_at: (H,) time of the newest reading, or of the registration.

@@ -80,6 +80,8 @@ class Host:
         over_since: the same, or the later time of the last move off the host.
         over_at: resource name to the time of the last reading over the limit, from the record
             `over_limit` to the record `under_limit`.
+        unreached: an assignment to it was given up without an answer, and it has not reported all
+            of its instances since: orders may not arrive there, although its messages do.
         drained: the host is draining, and no process that can leave is left on it.
         pruned: the host is left out of listings until it registers.
         recorded_at: kind of a record to its last time, for records that are not repeated at once.
@@ -98,6 +100,7 @@ class Host:
     cordoned: bool = False
     draining: bool = False
     drained: bool = False
+    unreached: bool = False
     pruned: bool = False
     attributed: frozenset[str] = frozenset()
     shared: frozenset[str] = frozenset()
@@ -516,7 +519,7 @@ class HostTable(HostColumns):
         return np.flatnonzero(ahead & (self.condition == HostCondition.UP))
 
     def set_report_due(self, host: Host, *, report_due: bool) -> None:
-        """Set whether a lost host has rejoined without a report of its instances yet."""
+        """Set whether a host gets no work until it has reported all of its instances."""
         if bool(self.report_due[host.column]) is not report_due:
             self.report_due[host.column] = report_due
             self.changed()
