@@ -463,7 +463,8 @@ class SlaveRuntime:
             self._endpoint.publish_statuses((), complete=False)
         present = self._sampler.present
         under = under_limits(sample.usage, self._limit, present, sample.stale)
-        self._accepting = under and not (self._stopping or self._ending.has_begun)
+        is_closed = self._stopping or self._ending.has_begun or self._supervisor.absence
+        self._accepting = under and not is_closed
         self._endpoint.publish_reading(
             sample.usage, self._limit, present, sample.stale, accepting=self._accepting,
             processes=self._state.live(),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import time
+import math
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -93,6 +94,8 @@ class SupervisorLink:
         self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
         self._is_closed = False
+        self._leaves = threading.Event()
+        self._absence = ""
         self._logged_waits = False
         self._brief = 0
         self._trouble = ("", 0.0)
@@ -102,12 +105,18 @@ class SupervisorLink:
     def close(self) -> None:
         """Close the connection; the supervisor continues to run its instances."""
         self._is_closed = True
+        self._leaves.set()
         self._client.close()
 
     @property
     def pid(self) -> int:
         """Return the pid of the supervisor."""
         return self._client.pid
+
+    @property
+    def absence(self) -> str:
+        """Return why there is no supervisor and none can be started; "": there is one."""
+        return self._absence
 
     @property
     def unenforced(self) -> Mapping[str, str]:
@@ -131,7 +140,11 @@ class SupervisorLink:
     # --- orders --------------------------------------------------------------------------
 
     def start(self, launches: Sequence[LaunchOrder]) -> None:
-        """Send launch orders."""
+        """Send launch orders; refuse them if no supervisor can be started."""
+        if self._absence:
+            for launch in launches:
+                self._take(events.LaunchRefused(launch.instance, self._absence))
+            return
         self._unanswered.update((launch.instance, launch) for launch in launches)
         # The receiving thread detects a killed supervisor and replaces it.
         with contextlib.suppress(SupervisorGone):
@@ -170,6 +183,7 @@ class SupervisorLink:
     def shut_down(self) -> None:
         """Order the supervisor to stop all processes and end."""
         self._is_shutting_down = True
+        self._leaves.set()
         with contextlib.suppress(SupervisorGone):
             self._client.send(orders.ShutdownOrdered())
 
@@ -208,11 +222,11 @@ class SupervisorLink:
             f"{pause:g} s. {self.state / OWN_LOG} may have the reason"
         )
         self._trouble = (fault, clocks.boot_time() + pause + _STEADY)
-        time.sleep(pause)
+        self._leaves.wait(pause)
 
     def trouble(self, now: float) -> str:
-        """Return why supervisors end again and again; "": they do not."""
-        fault, until = self._trouble
+        """Return why supervisors end again and again, or none starts; "": one works."""
+        fault, until = (self._absence, math.inf) if self._absence else self._trouble
         return fault.replace(str(self.state), "STATE") if now < until else ""
 
     def _receive(self, client: SupervisorClient) -> None:
@@ -220,23 +234,47 @@ class SupervisorLink:
         try:
             while True:
                 self._post(partial(self._take_messages, client.receive(None)))
-        except (SupervisorGone, SupervisorEnded) as gone:  # ended: by a SIGTERM to it alone
-            if self._is_shutting_down or self._is_closed:
+        except SupervisorError as gone:  # `SupervisorEnded`: by a SIGTERM to it alone
+            if self._leaves.is_set():
                 raise
             _log.info("%s; connecting to the next one", gone)
 
     def _next(self) -> SupervisorClient:
-        """Return a connection to the next supervisor, or to the same one if it was silent."""
-        logged = False
+        """Return a connection to the next supervisor, or to the same one if it was silent.
+
+        If none can be started, try again with back-off: the slave stays, and reports its instances.
+        """
+        logged, tries = False, 0
         while True:
             try:
-                return SupervisorClient.connect(self.state, log=self._limits, timeout=_PATIENCE)
+                client = SupervisorClient.connect(self.state, log=self._limits, timeout=_PATIENCE)
             except SupervisorSilent as silence:
                 if self._is_closed:
                     raise
                 if not logged:
                     _log.info("%s; waiting until it does", silence)
                 logged = True
+            except SupervisorError as error:
+                if self._leaves.is_set():
+                    raise
+                pause = min(2.0**tries, _LONGEST_PAUSE)
+                tries += pause < _LONGEST_PAUSE
+                self._note_absence(str(error), pause)
+                self._leaves.wait(pause)
+            else:
+                self._absence = ""
+                return client
+
+    def _note_absence(self, fault: str, pause: float) -> None:
+        """Refuse starts from now on, and report those that the former supervisor may have begun."""
+        if self._absence != fault:
+            _log.error("%s; no process is started here; next try in %g s", fault, pause)
+        self._absence = fault
+        self._post(partial(self._delay_unanswered, fault))
+
+    def _delay_unanswered(self, fault: str) -> None:
+        for instance in self._unanswered:
+            self._take(events.StartDelayed(instance, fault))
 
     def _take_messages(self, received: Sequence[SupervisorMessage]) -> None:
         statuses = tuple(

@@ -13,6 +13,7 @@ import pytest
 from rosrm import clocks
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
+from rosrm.errors import SupervisorError
 from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.supervisor import send_buffer
@@ -113,6 +114,47 @@ def test_a_supervisor_that_was_ended_by_another_is_replaced(loop) -> None:
     assert status.state is InstanceState.WITHDRAWN
     loop.link.start([loop.host.order("two", "sleep", "1000")])
     loop.wait(lambda: InstanceId("two", 1) in loop.started(), "the next one starts processes")
+
+
+def test_a_supervisor_that_cannot_start_does_not_end_the_slave(loop, monkeypatch) -> None:
+    """The slave says why, refuses starts, and tries again until one starts."""
+    connect, faults = SupervisorClient.connect, ["no room", "no room"]
+
+    def hindered(*args, **options):
+        if faults:
+            raise SupervisorError(faults[0])
+        return connect(*args, **options)
+
+    monkeypatch.setattr(SupervisorClient, "connect", hindered)
+    os.kill(loop.pid, signal.SIGKILL)
+    wait_gone(loop.pid)
+    loop.wait(lambda: loop.link.absence, "no supervisor can be started")
+    assert loop.link.trouble(clocks.boot_time()) == "no room"
+    loop.link.start([loop.host.order("one", "sleep", "1000")])
+    assert loop.events[-1] == events.LaunchRefused(InstanceId("one", 1), "no room")
+    faults.clear()
+    loop.wait(lambda: len(loop.replaced()) == 2, "another one has started")
+    loop.supervisor()
+    assert (loop.ended, loop.link.absence) == ([], "")
+    loop.link.start([loop.host.order("two", "sleep", "1000")])
+    loop.wait(lambda: InstanceId("two", 1) in loop.started(), "the next one starts processes")
+
+
+def test_a_start_that_the_former_supervisor_may_have_begun_is_not_refused(
+    loop, monkeypatch
+) -> None:
+    """The process may run, so the slave reports that its start takes long."""
+
+    def fail(*_args, **_options):
+        raise SupervisorError("no room")
+
+    monkeypatch.setattr(SupervisorClient, "connect", fail)
+    os.kill(loop.pid, signal.SIGSTOP)
+    loop.link.start([loop.host.order("one", "sleep", "1000")])
+    os.kill(loop.pid, signal.SIGKILL)
+    wait_gone(loop.pid)
+    delayed = events.StartDelayed(InstanceId("one", 1), "no room")
+    loop.wait(lambda: delayed in loop.events, "its start is reported as delayed")
 
 
 def test_orders_to_a_stopped_supervisor_wait_for_it(loop) -> None:
