@@ -218,7 +218,7 @@ class MasterRuntime:
         state.plugins.limit = self._deadlines
         state.chain_of = self._reload.chain_of
         state.scoring = state.scoring_in_force = settings_of_chain(self._config)
-        state.wall = clocks.wall_time()
+        state.wall, state.boot = clocks.wall_time(), _boot()
         state.replication.policy = self._checkpoint
         state.replication.policy_name = self._config.checkpoint.policy or ""
         return state

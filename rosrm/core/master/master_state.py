@@ -115,6 +115,7 @@ class MasterState:
             of submission, because a replay must begin them in the same order.
         held_since: time since when placement waits for first requests for work; inf: no wait.
         contact_since: time since when at least one host reports; inf: none does.
+        boot: id of the boot of the master's machine, from which its clock counts; "": unknown.
         restored_at: time at which this master read its journal; -inf: it has read none.
         next_loss: time at which the next host is lost, unless it reports before; inf: none is.
         strays: process name to the numbers of the instances that a host reports although the master
@@ -185,6 +186,7 @@ class MasterState:
         self.periodic = Periodic()
         self.next_order = self.next_instance = self.reserved_instances = 1
         self.wall = 0.0
+        self.boot = ""
         self.restored_at = -inf
         self.contact_since = self.next_loss = inf
         self.held_since = inf

@@ -202,11 +202,13 @@ class Cluster(World[Machine]):
         intents: durable tables, as in the journal: table -> key -> value, as JSON has it.
         carried: every command that was carried out.
         watch: called with the commands of each step before they are carried out.
+        boot: id of the boot of the master's machine.
         clock_set_by: seconds by which the master's clock of the day was set.
     """
 
     now = 100.0
     clock_set_by = 0.0
+    boot = "of the master's machine"
     checks = 20
 
     def __init__(
@@ -235,7 +237,7 @@ class Cluster(World[Machine]):
         state = MasterState(
             self.settings, self.placement(), self.strategies, epoch, declared=self.declared
         )
-        state.wall = self.wall
+        state.wall, state.boot = self.wall, self.boot
         return state
 
     @property

@@ -64,6 +64,42 @@ def test_running_processes_keep_running_and_are_not_started_twice() -> None:
     assert len(cluster.assigned()) == 2
 
 
+@pytest.mark.parametrize("seconds", [-3600.0, 3600.0])
+def test_the_age_of_a_phase_is_not_that_of_a_clock_that_was_set(seconds: float) -> None:
+    """The next master on the machine reads the boot clock."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.wait(60.0)
+    since = cluster["p"].since
+    cluster.clock_set_by = seconds
+    cluster.restart_master()
+    assert cluster["p"].since == since
+
+
+@pytest.mark.parametrize("boot", ["another", ""])
+def test_after_a_boot_the_age_of_a_phase_is_that_of_the_clock_of_the_day(boot: str) -> None:
+    """The boot clock has begun again, or its boot is not known."""
+    cluster = Cluster("a").with_processes(process("p"))
+    since = cluster["p"].since
+    cluster.clock_set_by = 3600.0
+    cluster.boot = boot
+    cluster.restart_master()
+    assert cluster["p"].since == pytest.approx(since - 3600.0)
+
+
+def test_the_age_of_a_move_is_not_that_of_a_clock_that_was_set() -> None:
+    """The record of the move has its seconds."""
+    cluster = Cluster("a", "b").with_processes(movable("p"))
+    cluster.wait(60.0)
+    (source,) = cluster.where("p")
+    cluster.machines[source].stubborn.add("p")
+    assert cluster.migrate("p").accepted
+    cluster.wait(1.0)
+    started = cluster.state.migrations["p"].started
+    cluster.clock_set_by = 3600.0
+    cluster.restart_master()
+    assert cluster.state.migrations["p"].started == started
+
+
 def test_a_process_that_runs_as_before_is_not_written_again() -> None:
     """The journal already has the phase and its start, exactly as this master would write them."""
     cluster = Cluster("a").with_processes(process("p"))

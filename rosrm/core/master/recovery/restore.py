@@ -94,10 +94,11 @@ def _restore_applications(state: MasterState, intents: Callable[[str], _Table]) 
 def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) -> Process:
     phase = ProcessPhase(item["phase"])
     wall = float(item.get("since", state.wall))  # absent in older journals
+    since = _restored_moment(state, item, wall, now)
     left, image = item.get("left_behind"), item.get("image")  # absent in older journals
     process = Process(
         spec=from_plain(ProcessSpec, item["spec"]), phase=phase,
-        since=now - max(0.0, state.wall - wall), wall=wall,  # the clock may have been set back
+        since=since, wall=wall,
         ended_on=item["host"], ran_before=float(item.get("ran_before", 0.0)),
         left_behind=from_plain(LeftBehind, left) if left else None,
         **fields_from_plain(Process, item, processes.JOURNALED),
@@ -114,6 +115,18 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
     state.add_process(process)
     images.set_image(state, process, None if image is None else from_plain(Image, image))
     return process
+
+
+def _restored_moment(state: MasterState, item: Mapping[str, Any], wall: float, now: float) -> float:
+    """Return a journaled time by this master's clock.
+
+    The clock of the day may have been set since. Its time `wall` counts only if the machine has
+    booted in between, or if another machine wrote the journal.
+    """
+    boot, at = item.get("at", ("", 0.0))  # absent in older journals
+    if boot and boot == state.boot:
+        return min(now, float(at))
+    return now - max(0.0, state.wall - wall)
 
 
 def _restore_place(state: MasterState, process: Process, now: float) -> None:
@@ -238,9 +251,8 @@ def _restored_migration(
     hosts = state.hosts.by_name
     plan = from_plain(Plan, move["plan"])
     wall = float(move.get("wall", state.wall))  # absent in older journals
-    started = now - max(0.0, state.wall - wall)  # the clock may have been set back
     restored = Migration(
-        process.name, plan, started=started,
+        process.name, plan, started=_restored_moment(state, move, wall, now),
         source=InstanceId(process.name, int(move["source"])),
         source_host=hosts[move["source_host"]],
         destination=InstanceId(process.name, int(move["destination"])),

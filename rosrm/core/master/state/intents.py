@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from operator import attrgetter
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 from rosrm.core.master.state.applications import (
     Application,
@@ -30,8 +31,9 @@ _journaled_of: Final = attrgetter(*JOURNALED)
 
 
 class Tables(Protocol):
-    """The tables of the master's state that intents of processes and migrations are made of."""
+    """The parts of the master's state that intents of processes and migrations are made of."""
 
+    boot: str
     processes: dict[str, Process]
     instances: dict[int, Instance]
     standbys: dict[str, Migration]
@@ -75,14 +77,15 @@ def process_intent(tables: Tables, process: Process) -> Intent:
     instances = [(str(number), tables.instances[number]) for number in process.instances]
     owner, left = tables.instances.get(process.owner), process.left_behind
     restart = owner and owner.restarting
-    phase, _, began = process.phase_before_loss or (process.phase, 0.0, process.wall)
+    now = process.phase, process.since, process.wall
+    phase, since, wall = process.phase_before_loss or now
     standby, pending = tables.standbys.get(process.name), tables.unamended.get(process.name)
     return Intent(
         "process", process.name,
         {
             "spec": process.plain,
             "next_spec": process.next_spec and to_plain(process.next_spec),
-            "phase": phase.value, "since": began,
+            "phase": phase.value, "since": wall, "at": moment(tables.boot, since),
             "host": owner.host.name if owner else process.ended_on,
             "instances": {number: one.host.name for number, one in instances},
             "node_names": {number: one.node_name for number, one in instances if one.node_name},
@@ -91,7 +94,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
                 number: to_plain(one.spec) for number, one in instances
                 if one.spec is not process.spec and one.spec != process.spec
             },
-            "standby": standby and migration_to_dict(standby, ()),
+            "standby": standby and _migration(tables, standby, ()),
             "left_behind": left and to_plain(left),
             "restart": restart and fields_to_plain(restart, JOURNALED_RESTART),
             "image": process.image and to_plain(process.image),
@@ -108,7 +111,17 @@ def migration_intent(tables: Tables, migration: Migration) -> Intent:
     """Return the progress of a migration."""
     numbers = sorted(tables.processes[migration.process].instances)
     stopping = [number for number in numbers if tables.instances[number].stopping]
-    return Intent("migration", migration.process, migration_to_dict(migration, stopping))
+    return Intent("migration", migration.process, _migration(tables, migration, stopping))
+
+
+def _migration(tables: Tables, migration: Migration, stopping: Sequence[int]) -> dict[str, Any]:
+    at = moment(tables.boot, migration.started)
+    return {**migration_to_dict(migration, stopping), "at": at}
+
+
+def moment(boot: str, at: float) -> list[str | float]:
+    """Return a time of the master's clock, which counts from the boot of its machine, as plain."""
+    return [boot, at]
 
 
 def application_intent(application: Application) -> Intent:
