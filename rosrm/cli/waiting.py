@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import queue
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Final
+from functools import partial
+from typing import Final, NoReturn, TypeVar
 
 import typer
 
+from rosrm import threads
 from rosrm.cli.options import seconds_of
 from rosrm.cli.output.plain import echo
 from rosrm.client.waiting import UNTIL_ASKED, WaitResult
-from rosrm.errors import NoMaster
+from rosrm.errors import NoMaster, RosrmError
 from rosrm.model.rows import ProcessRow
 from rosrm.wording import listed, standing, words
 
+T = TypeVar("T")
+
+#: Seconds for a look at files of this machine.
+PATIENCE: Final = 10.0
 _NOTEWORTHY: Final = UNTIL_ASKED | {"set_aside", "unreachable", "unknown"}
 
 
@@ -63,7 +70,7 @@ def show_processes(result: WaitResult) -> None:
             err=True,
         )
     elif result.pending:
-        _say_time_is_up(result.pending)
+        _say_time_is_up(result)
     if result.missing:
         echo(
             f"rosrm: no longer listed, and not seen to be done: {listed(result.missing)} "
@@ -76,7 +83,7 @@ def show_processes(result: WaitResult) -> None:
 def show_end(result: WaitResult) -> None:
     """Print the result of a migration or drain; exit with 1 if it is not done."""
     if result.pending:
-        _say_time_is_up(result.pending)
+        _say_time_is_up(result)
     elif result.done or result.event:
         echo(result.message, err=not result.done)
     else:
@@ -89,5 +96,44 @@ def _exit_unless_done(result: WaitResult) -> None:
         raise typer.Exit(1)
 
 
-def _say_time_is_up(awaited: Sequence[str]) -> None:
-    echo(f"rosrm: --timeout has passed; still waiting for {listed(awaited)}", err=True)
+def _say_time_is_up(result: WaitResult) -> None:
+    """Print what is still awaited, with the reason of each process that has one."""
+    why = {row.name: f" ({row.reason})" for row in result.processes if row.reason}
+    awaited = listed(f"{name}{why.get(name, '')}" for name in result.pending)
+    echo(f"rosrm: --timeout has passed; still waiting for {awaited}", err=True)
+
+
+def answered(call: Callable[[], T], what: str, seconds: float = PATIENCE) -> T:
+    """Return the result of a call that a file system or the kernel may hold.
+
+    Args:
+        call: is left to itself in its thread if it does not return.
+        what: subject of the message, e.g. "the search for a file".
+        seconds: time-out.
+
+    Raises:
+        RosrmError: it has not returned in time.
+    """
+    outcomes: queue.SimpleQueue[Callable[[], T]] = queue.SimpleQueue()
+
+    def run() -> None:
+        try:
+            result = call()
+        except Exception as fault:  # noqa: BLE001 - raised again in the caller
+            outcomes.put(partial(_raise, fault))
+        else:
+            outcomes.put(lambda: result)
+
+    threads.start(run, what)
+    try:
+        outcome = outcomes.get(timeout=seconds)
+    except queue.Empty:
+        raise RosrmError(
+            f"{what} has not ended within {seconds:g} s: the kernel, or a file system without an "
+            "answer, holds it"
+        ) from None
+    return outcome()
+
+
+def _raise(fault: Exception) -> NoReturn:
+    raise fault

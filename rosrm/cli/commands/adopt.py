@@ -33,9 +33,16 @@ def adopt(
             autocompletion=completion.hosts,
         ),
     ] = "",
+    *,
     plan: Annotated[
         bool, typer.Option("--plan", help="Print the entry of a work file, and change nothing.")
     ] = False,
+    timeout: Annotated[
+        str,
+        typer.Option(
+            "--timeout", metavar="TIME", help="Maximum wait for the adoption, e.g. 5min."
+        ),
+    ] = "60s",
     domain: Domain = None,
 ) -> None:  # fmt: skip
     """Watch, stop and restart a process that was started without rosrm.
@@ -48,17 +55,21 @@ def adopt(
     from rosrm.cli.adoption.entry import entry_of, has_relaunch
     from rosrm.cli.adoption.facts import read_facts
     from rosrm.cli.adoption.local_host import environment_on, local_host
-    from rosrm.cli.waiting import interruptible, show_change, show_processes
+    from rosrm.cli.waiting import answered, interruptible, longest, show_change, show_processes
     from rosrm.config.work import processes_of
     from rosrm.model.adoption import Adoption
     from rosrm.supervisor.procfs import boot_id
 
-    facts = read_facts(pid)
+    limit = longest(timeout)
+    facts = answered(lambda: read_facts(pid), f"the look at process {pid}")
     with connection.master(ctx, domain) as client:
         row = local_host(client.list_hosts(), host)
         settings = connection.ros_settings(ctx, domain)
         moves = has_relaunch(client.list_plugins())
-        entry = entry_of(facts, name, environment_on(row, settings), moves=moves)
+        entry = answered(
+            lambda: entry_of(facts, name, environment_on(row, settings), moves=moves),
+            f"the search for the program of process {pid}",
+        )
         (spec,) = processes_of(entry.keys)
         where = row.description.name
         _show(entry, f"process {pid} of {where}")
@@ -67,7 +78,7 @@ def adopt(
         adopted = Adoption(where, pid, facts.birth, boot_id())
         echo(client.submit(replace(spec, adoption=adopted)))
         with interruptible(f"{name} stays with rosrm (`rosrm ps`)"):
-            show_processes(client.wait([name], on_change=show_change))
+            show_processes(client.wait([name], timeout=limit, on_change=show_change))
 
 
 def _show(entry: Entry, process: str) -> None:

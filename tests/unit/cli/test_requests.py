@@ -163,12 +163,16 @@ def test_submit_wait_ends_when_no_process_is_awaited(
 
 
 def test_submit_wait_gives_up_after_its_time(rosrm, client, work, monkeypatch):
-    """The message names processes that have not ended, and no others."""
+    """The message names processes that have not ended, with reasons, and no others."""
     monkeypatch.setattr("rosrm.client.waiting.PERIOD", 0.01)
-    client.processes = [process("a", "starting", kind="job"), process("b", "finished")]
+    client.processes = [
+        process("a", "starting", kind="job", reason="its artifacts are fetched"),
+        process("b", "finished"),
+    ]  # fmt: skip
     result = rosrm("submit", work, "--wait", "--timeout", "50ms")
     assert result.code == 1
-    assert "--timeout has passed; still waiting for a\n" in result.err
+    awaited = "a (its artifacts are fetched)"
+    assert f"--timeout has passed; still waiting for {awaited}\n" in result.err
 
 
 def test_ctrl_c_in_a_wait_says_that_the_processes_stay(rosrm, client, work, while_asleep):
