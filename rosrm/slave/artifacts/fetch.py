@@ -12,6 +12,7 @@ from rosrm.errors import Refused, describe_fault
 from rosrm.model.artifacts import Artifact
 from rosrm.ros.slave.artifacts import ArtifactEndpoint, ArtifactPart
 from rosrm.runtime.worker import Worker
+from rosrm.wording import duration
 
 #: Seconds for one answer; then the part is requested again.
 _ANSWER: Final = 3.0
@@ -52,7 +53,7 @@ class Fetch:
         self._writing = 0
         self._incoming: Incoming | None = None
         self._progress_at = clocks.boot_time()
-        self._silence = "its service was not found"
+        self._silence = "the master's service was not found"
         worker.run(partial(cache.begin, artifact, used), self._begun, self._failed)
 
     def cancel(self) -> None:
@@ -67,10 +68,8 @@ class Fetch:
         if not self._has_master():  # it cannot choose another host
             self._progress_at = now
         if not self._waits and now - self._progress_at >= PATIENCE:
-            self._end(
-                f"artifact {self.artifact.name!r} was not fetched: no part of it came from the "
-                f"master within {PATIENCE:g} s ({self._silence})"
-            )
+            none = f"no part of it came from the master within {PATIENCE:g} s"
+            self._end(self._not_fetched(f"{none} ({self._silence})"))
         elif self._may_ask and self._endpoint.finds_master(now):
             self._waits = True
             self._endpoint.ask(self.artifact.digest, self.offset, now + _ANSWER, self._answered)
@@ -94,17 +93,17 @@ class Fetch:
             return
         self._waits = False
         if part is None:
-            self._silence = "it does not answer"
+            self._silence = "the master does not answer"
         elif isinstance(part, Refused) and part.code in _AGAIN:
             self._silence = str(part)
             self._progress_at = clocks.boot_time()  # the master is alive
         elif isinstance(part, Refused):
-            self._end(f"artifact {self.artifact.name!r} was not fetched: {part}")
+            self._end(self._not_fetched(str(part)))
         elif part.size != self.artifact.size or not part.data:
-            self._end(
-                f"artifact {self.artifact.name!r} was not fetched: the master has {part.size} "
-                f"bytes for its digest, and the process names {self.artifact.size}"
-            )
+            self._end(self._not_fetched(
+                f"the master has {part.size} bytes for its digest, and the process names "
+                f"{self.artifact.size}"
+            ))  # fmt: skip
         else:
             self._write(part.data)
 
@@ -130,8 +129,17 @@ class Fetch:
 
     def _failed(self, error: Exception) -> None:
         if not self._has_ended:
-            reason = str(error) if isinstance(error, Refused) else describe_fault(error)
-            self._end(reason)
+            refused = isinstance(error, Refused)  # its text names the artifact
+            why = str(error) if refused else self._not_fetched(describe_fault(error))
+            self._end(why)
+
+    def _not_fetched(self, why: str) -> str:
+        return f"artifact {self.artifact.name!r} was not fetched: {why}"
+
+    def stalled(self, now: float) -> str:
+        """Return what a fetch waits for, once a request was not answered in time; "": nothing."""
+        waits = now - self._progress_at
+        return f"{self._silence} ({duration(waits)})" if waits > _ANSWER else ""
 
     def _end(self, fault: str) -> None:
         self._has_ended = True

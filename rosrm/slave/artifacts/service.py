@@ -101,16 +101,20 @@ class ArtifactService:
         for waits in list(self._preparing.values()):
             if waits.missing and now - waits.reported_at >= _REPORT_PERIOD:
                 waits.reported_at = now
-                self._report(waits.assignment.instance, self._progress(waits))
+                self._report(waits.assignment.instance, self._progress(waits, now))
 
-    def _progress(self, waits: _Preparation) -> str:
+    def _progress(self, waits: _Preparation, now: float) -> str:
         artifacts = {one.digest: one.size for one in waits.assignment.spec.artifacts}
-        left = 0
+        left, stalls = 0, set()
         for one in waits.missing or ():
             fetch = self._fetches.get(one.digest)
             left += one.size - (fetch.offset if fetch is not None else 0)
+            stalls.add(fetch.stalled(now) if fetch is not None else "")
         whole = sum(artifacts.values())
-        return f"fetches artifacts, {sized(whole - left)} of {sized(whole)}"
+        why = "; ".join(sorted(stalls - {""}))
+        return f"fetches artifacts, {sized(whole - left)} of {sized(whole)}" + (
+            f": {why}" if why else ""
+        )
 
     # --- preparation ---------------------------------------------------------------------
 
@@ -174,7 +178,8 @@ class ArtifactService:
 
     def _fail(self, instance: InstanceId, error: Exception) -> None:
         refused = isinstance(error, Refused)
-        self._finish(instance, str(error) if refused else describe_fault(error))
+        cannot = "the artifacts cannot be used here: "
+        self._finish(instance, str(error) if refused else cannot + describe_fault(error))
 
     def _finish(self, instance: InstanceId, fault: str) -> None:
         waits = self._preparing.pop(instance, None)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 
 from rosrm import clocks
-from rosrm.artifacts.cache import set_directory, without_directories
+from rosrm.artifacts.cache import ArtifactCache, set_directory, without_directories
 from rosrm.artifacts.pack import Archive
 from rosrm.core.slave import reducer
 from rosrm.core.slave.events import SupervisorReplaced, SupervisorReported
@@ -191,11 +191,40 @@ def test_a_silent_master_is_a_refusal_in_time(host, offered, monkeypatch, tmp_pa
     one = offered("model")
     monkeypatch.setattr(fetch, "PATIENCE", 1.5)
     host.master.is_silent = True
-    assert "no part of it came from the master within 1.5 s (it does not answer)" in host.outcome(
-        host.prepare(1, one)
+    assert (
+        "no part of it came from the master within 1.5 s (the master does not answer)"
+        in host.outcome(host.prepare(1, one))
     )
     assert host.reports[0] == "fetches artifacts, 0 B of 302 kB"
     host.run_until(lambda: not list((tmp_path / "artifacts/incoming").iterdir()), "removed")
+
+
+@pytest.mark.parametrize(
+    ("call", "reason"),
+    [
+        ("begin", "artifact 'model' was not fetched: PermissionError: [Errno 13] no"),
+        ("finish", "artifact 'model' was not fetched: PermissionError: [Errno 13] no"),
+        ("missing", "artifacts cannot be used: PermissionError: [Errno 13] no"),
+        ("assemble", "artifacts cannot be used: PermissionError: [Errno 13] no"),
+    ],
+)
+def test_an_error_of_the_disk_says_what_it_has_prevented(host, offered, monkeypatch, call, reason):
+    """`rosrm ps` and `explain` show the sentence, which alone would name no artifact."""
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "no")
+
+    monkeypatch.setattr(ArtifactCache, call, refuse)
+    assert reason in host.outcome(host.prepare(1, offered("model")))
+
+
+def test_a_fetch_that_stalls_says_what_it_waits_for(host, offered, monkeypatch):
+    """The progress alone would show the same bytes for a minute."""
+    monkeypatch.setattr(fetch, "_ANSWER", 0.1)
+    host.master.is_silent = True
+    host.prepare(1, offered("model"))
+    host.run_until(lambda: host.reports, "a report")
+    assert "of 302 kB: the master does not answer (1" in host.reports[0]
 
 
 def test_a_host_without_a_master_waits(host, offered, monkeypatch):
