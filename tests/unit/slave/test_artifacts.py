@@ -204,8 +204,8 @@ def test_a_silent_master_is_a_refusal_in_time(host, offered, monkeypatch, tmp_pa
     [
         ("begin", "artifact 'model' was not fetched: PermissionError: [Errno 13] no"),
         ("finish", "artifact 'model' was not fetched: PermissionError: [Errno 13] no"),
-        ("missing", "artifacts cannot be used: PermissionError: [Errno 13] no"),
-        ("assemble", "artifacts cannot be used: PermissionError: [Errno 13] no"),
+        ("missing", "the artifacts cannot be used here: PermissionError: [Errno 13] no"),
+        ("assemble", "the artifacts cannot be used here: PermissionError: [Errno 13] no"),
     ],
 )
 def test_an_error_of_the_disk_says_what_it_has_prevented(host, offered, monkeypatch, call, reason):
