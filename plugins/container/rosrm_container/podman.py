@@ -29,8 +29,10 @@ _PASSED: Final = (
 #: Variables of these that describe the ROS installation of the host, or its files.
 _OF_HOST: Final = (
     "ROS_DISTRO", "ROS_ETC_DIR", "ROS_HOME", "ROS_LOG_DIR", "ROS_PACKAGE_PATH",
-    "ROS_PYTHON_VERSION", "ROS_ROOT", "ROS_VERSION", "ROSRM_EPOCH_FILE",
+    "ROS_PYTHON_VERSION", "ROS_ROOT", "ROS_VERSION", "ROSRM_EPOCH_FILE", start.KEY_FILE,
 )  # fmt: skip
+#: The key of the instance in the container. In a variable, `podman inspect` would show it.
+_KEY: Final = "/run/rosrm-instance.key"
 #: Variables that the supervisor adds; they mark the processes of an instance.
 _MARKS: Final = ("ROSRM_INSTANCE", "ROSRM_SUPERVISOR")
 #: Variables that podman itself reads.
@@ -70,7 +72,8 @@ class Podman:
             self._program, "run", "--rm", "--replace", f"--name={name}",
             f"--label={start.LABEL}={self._label}", f"--pidfile={self._folder / name}.pid",
             "--pull=never", "--network=host", "--ipc=host", "--init", "--cgroups=disabled",
-            "--log-driver=none", "--sdnotify=ignore", *variables, *_mounts(launch), image,
+            "--log-driver=none", "--sdnotify=ignore", *variables, *_mounts(launch),
+            *_key_options(launch, self._folder / name), image,
             *launch.argv,
         ]  # fmt: skip
         argv = (self._python, "-I", "-S", start.__file__, *run)
@@ -167,6 +170,17 @@ def _variables(launch: Launch) -> tuple[dict[str, str], list[str]]:
         else:
             options.append(f"--env={name}")
     return environment, options
+
+
+def _key_options(launch: Launch, own: Path) -> Iterator[str]:
+    """Yield options that give the container the key of its instance in a file.
+
+    Args:
+        own: path of the files of the container; the copy is made at each start (`start`).
+    """
+    if start.KEY_FILE in launch.environment:
+        yield f"--volume={own}.key:{_KEY}:ro"
+        yield f"--env={start.KEY_FILE}={_KEY}"
 
 
 def _mounts(launch: Launch) -> Iterator[str]:

@@ -13,11 +13,14 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 #: Label of the containers of one slave.
 LABEL: Final = "rosrm.slave"
+#: Variable with the path of the key of the instance, which only the user of the slave can read.
+KEY_FILE: Final = "ROSRM_INSTANCE_KEY_FILE"
 #: Seconds for podman to list or to remove containers.
 _PATIENCE: Final = 30.0
 
@@ -27,14 +30,30 @@ def main(argv: list[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # a stop during the start needs no traceback
     program, own = argv[0], Path(_option(argv, "--pidfile="))
     own.unlink(missing_ok=True)  # of an earlier start
-    listed, files = set(_listed(program, _option(argv, "--label="))), list(own.parent.glob("*.pid"))
+    files = [one for ending in ("*.pid", "*.key") for one in own.parent.glob(ending)]
+    listed = set(_listed(program, _option(argv, "--label=")))
     running = set(_running())  # read last, because another container may start at this moment
     for file in files:
         if file.stem not in running:
             file.unlink(missing_ok=True)
+    _copy_key(own.with_suffix(".key"))
     if listed - running:
         _ask(program, "rm", "--force", "--time=0", *(listed - running))
     os.execv(program, argv)  # noqa: S606 - no shell is wanted
+
+
+def _copy_key(copy: Path) -> None:
+    """Copy the key of the instance for the container, whose user may be any.
+
+    The directory of the copy lets no other user of this host in. Without a key of the slave, as on
+    a full disk, podman reports the missing file, and the process is started again.
+    """
+    key = os.environ.get(KEY_FILE, "")
+    if key:
+        copy.unlink(missing_ok=True)
+        with suppress(OSError):
+            copy.write_bytes(Path(key).read_bytes())
+            copy.chmod(0o444)
 
 
 def _option(argv: list[str], option: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,9 +113,7 @@ def process_environment(
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     # Of each process, because a migratable node without a key takes messages of strangers.
     key = where.instance_key(assignment.instance)
-    if key is not None and spec.container.image:  # its image does not have the files of the host
-        environment[INSTANCE_KEY] = base64.b64encode(key).decode()
-    elif key is not None and where.key_file is not None:
+    if key is not None and where.key_file is not None:
         environment[KEY_FILE] = where.key_file(assignment.instance)
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update((name, extended(text, of_host)) for name, text in spec.environment.items())

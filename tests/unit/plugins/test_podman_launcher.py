@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import stat
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -97,3 +99,23 @@ def test_a_leader_without_a_command_line_may_run_a_container_soon(launcher) -> N
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         assert launcher.leads(process.pid) is None
     assert launcher.leads(process.pid) is False
+
+
+def test_the_key_of_the_instance_is_mounted_and_in_no_variable(launcher, tmp_path) -> None:
+    """Any user of the container reads the copy, and no other user of the host finds it."""
+    key = tmp_path / "p.key"
+    key.write_bytes(b"c2VjcmV0")
+    key.chmod(0o600)
+    launch = prepared(launcher, ROSRM_INSTANCE_KEY_FILE=str(key))
+    (volume,) = (word for word in launch.argv if word.startswith("--volume="))
+    copy, inside, mode = volume.removeprefix("--volume=").split(":")
+    assert f"ROSRM_INSTANCE_KEY_FILE={inside}" in passed(launch)
+    assert mode == "ro"
+    subprocess.run(launch.argv, env={**os.environ, **launch.environment}, check=False, timeout=60)
+    assert Path(copy).read_bytes() == b"c2VjcmV0"
+    assert stat.S_IMODE(Path(copy).stat().st_mode) == 0o444
+    assert stat.S_IMODE(Path(copy).parent.stat().st_mode) == 0o700
+    left_over = Path(copy).with_name("rosrm-other-p-1.key")
+    left_over.touch()
+    subprocess.run(launch.argv, env={**os.environ, **launch.environment}, check=False, timeout=60)
+    assert not left_over.exists()

@@ -591,11 +591,12 @@ def test_each_process_gets_the_key_of_its_instance_in_a_file(tmp_path):
     assert "ROSRM_INSTANCE_KEY_FILE" not in process_environment(stateful, made, HERE)
 
 
-def test_a_process_in_a_container_gets_its_key_in_the_environment():
-    """The files of the host are not in its image."""
-    made = process_environment(assignment(command=("x",), container=Container("image")), {}, KEYED)
-    assert identity_from(made).key == b"talker#7".ljust(32)
-    assert "ROSRM_INSTANCE_KEY" not in process_environment(assignment(command=("x",)), made, HERE)
+def test_a_process_in_a_container_gets_its_key_in_a_file_too(tmp_path):
+    """Its launcher mounts the file; `podman inspect` shows the variables of a container."""
+    here = replace(KEYED, key_file=lambda _: "/state/p.key")
+    made = process_environment(assignment(command=("x",), container=Container("image")), {}, here)
+    assert made["ROSRM_INSTANCE_KEY_FILE"] == "/state/p.key"
+    assert "ROSRM_INSTANCE_KEY" not in made
 
 
 def test_the_identity_of_the_slave_is_not_inherited():
