@@ -43,7 +43,7 @@ from benchmarks.stopping import run
 from benchmarks.throughput import wait_for_all
 from benchmarks.web import gateway
 from rosrm.config.settings import ClusterConfig
-from rosrm.model.applications import Target
+from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.values import Kind, MigrationPolicy, ProcessSpec
 from rosrm.testing.local_cluster import LocalCluster
 
@@ -53,6 +53,8 @@ _BATCH: Final = 100
 _PATIENCE: Final = 120.0
 _MOVED: Final = "moved"
 _APPLICATION: Final = "versions"
+#: All processes together, each without a time in which it has to prove itself.
+_AT_ONCE: Final = RolloutPolicy(max_parallel=3, healthy_for=0.0)
 _ALERTS: Final = """
 sinks: {log: {use: command, command: ["true"]}}
 alerts: {failing: {when: {event: failed, count: 3, within: 10min}, to: log}}
@@ -183,7 +185,7 @@ class Soak:
             replace(_service(f"{_APPLICATION}_{number}", seconds), application=_APPLICATION)
             for number in range(3)
         )
-        self.cluster.client.apply([Target(_APPLICATION, specs)])
+        self.cluster.client.apply([Target(_APPLICATION, specs, rollout=_AT_ONCE)])
         wait_until_it_runs(self.cluster, _APPLICATION)
 
     def restart(self, number: int) -> None:

@@ -38,6 +38,7 @@ for target in "$@"; do
 import fcntl, socket, struct
 with socket.socket() as one:  # the loopback interface of a new namespace is down
     fcntl.ioctl(one, 0x8914, struct.pack(\"16sh\", b\"lo\", 0x49))"
+      mount --bind "$1" "$1"  # so that "/" inside is a mount, as on any machine
       mount --rbind /dev "$1/dev"
       mount --rbind /sys "$1/sys"
       mount -t proc proc "$1/proc"

@@ -100,7 +100,7 @@ download() {
         fi
         echo "  $(grep -m 1 '^E: ' "$place/log" || tail -n 1 "$place/log")" >&2
     done
-    fail "no mirror has CRIU for this machine (asked: ${mirrors:-none})"
+    fail "no mirror has CRIU for this machine (asked: $(echo ${mirrors:-none}))"
 }
 
 set -- "$folder"/packages/*.deb

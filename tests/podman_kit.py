@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.programs import path_of, require
+
 ROOT = Path(__file__).parents[1]
 IMAGE = "localhost/busybox:test"
 #: Link that is in the image and not on the host, and those to the libraries of the host.
@@ -41,9 +43,8 @@ def podman():
 
     Below a long path, podman does not notice the end of a container for 20 s.
     """
-    busybox = shutil.which("busybox")
-    if shutil.which("podman") is None or busybox is None:
-        pytest.skip("podman and a static busybox are required")
+    require("podman", "busybox")
+    busybox = path_of("busybox")
     with (
         tempfile.TemporaryDirectory(prefix="podman-", ignore_cleanup_errors=True) as short,
         pytest.MonkeyPatch.context() as monkeypatch,

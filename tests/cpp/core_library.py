@@ -6,7 +6,6 @@ import ctypes
 import fcntl
 import importlib.util
 import os
-import shutil
 import subprocess
 from collections.abc import Callable, Iterable
 from functools import cache
@@ -14,6 +13,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import pytest
+
+from tests.programs import require
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 PACKAGE: Final = ROOT / "rosrm_node_cpp"
@@ -33,14 +34,9 @@ INCLUDES: Final = (f"-I{PACKAGE / 'include'}", f"-I{STUBS}")
 VARIABLE: Final = "ROSRM_TEST_CPP_CORE"
 
 
-def compiler() -> str | None:
-    """Return a C++ compiler; None: there is none here."""
-    return shutil.which("g++") or shutil.which("clang++")
-
-
 def run_compiler(*arguments: str) -> None:
     """Compile; raise `RuntimeError` with the compiler's text if that fails."""
-    command = [compiler() or "g++", *FLAGS, *INCLUDES, *arguments]
+    command = ["g++", *FLAGS, *INCLUDES, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     if done.returncode:
         raise RuntimeError(done.stderr[-4000:])
@@ -68,8 +64,7 @@ def library_of(sources: Iterable[Path], folder: Path) -> Path:
 @pytest.fixture(scope="session")
 def cpp_core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the compiled core."""
-    if compiler() is None:
-        pytest.skip("no C++ compiler here")
+    require("g++")
     base = tmp_path_factory.getbasetemp()
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "cpp_core"
     folder.mkdir(exist_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import pytest
 
 from rosrm.runtime.ros_wheels import without_bootstrapper
 from tests.cpp.core_library import PACKAGE, STUBS
+from tests.programs import needs
 
 #: Packages that only a ROS installation with rclcpp has.
 ABSENT = ("rclcpp", "rcl_interfaces", "rosrm_msgs", "std_msgs")
@@ -33,10 +33,7 @@ def run(*words: str | Path, environment: dict[str, str]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(500)
-@pytest.mark.skipif(
-    any(shutil.which(one) is None for one in ("cmake", "pkg-config", "make", "c++")),
-    reason="cmake, pkg-config, make or a C++ compiler is missing",
-)
+@needs("cmake", "pkg-config", "make", "g++")
 def test_ament_cmake_builds_the_library(tmp_path):
     """The library is compiled and linked; the example needs rclcpp itself."""
     for name in ABSENT:

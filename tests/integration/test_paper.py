@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ import psutil
 import pytest
 
 from tests.integration.lab.conftest import why_not
+from tests.programs import require
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -109,8 +109,7 @@ def test_without_rights_one_message_says_what_is_missing(tmp_path):
     """Without rights nothing starts, and only the output folder is written."""
     drop = []
     if os.geteuid() == 0:
-        if not shutil.which("setpriv"):
-            pytest.skip("setpriv is not here to give up root's rights")
+        require("setpriv")
         drop = ["setpriv", "--bounding-set=-all", "--inh-caps=-all"]
     ended = subprocess.run(
         [*drop, *COMMAND, "fig6", "--out", str(tmp_path / "out")],

@@ -7,7 +7,6 @@ with rclcpp.
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ from std_msgs.msg import Int64
 from rosrm.runtime.ros_wheels import without_bootstrapper
 from rosrm_msgs.msg import StateConfig
 from tests.cpp.core_library import PACKAGE, ROOT
+from tests.programs import require
 from tests.ros.handoff_kit import goes_on, is_gapless
 from tests.ros.nodes import PATIENCE, Conductor
 
@@ -41,8 +41,7 @@ def cpp_counter(tmp_path_factory) -> list[str]:
     prefix = rclcpp_prefix()
     if prefix is None:
         pytest.skip("rclcpp is not installed (package ros-jazzy-rclcpp)")
-    if shutil.which("colcon") is None:
-        pytest.skip("colcon is not installed (package python3-colcon-common-extensions)")
+    require("colcon")
     folder = tmp_path_factory.mktemp("cpp")
     build = ["colcon", "build", "--base-paths", ROOT / "rosrm_msgs", PACKAGE]
     environment = without_bootstrapper(os.environ)

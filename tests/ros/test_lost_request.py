@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.programs import needs
+
 PROGRAM = Path(__file__).parent / "programs" / "lost_request.py"
 #: Seconds: less than with the default settings of Fast DDS, and long for a busy machine.
 QUICK = 2.0
 
 
-@pytest.mark.skipif(shutil.which("nft") is None, reason="needs nft (package nftables)")
+@needs("nft")
 @pytest.mark.parametrize("pace", ["eager", "steady"])
 def test_a_lost_request_is_repeated_by_its_writer(pace):
     """By default the writer of a request sends a heartbeat, which shows the loss, after 3 s."""

@@ -15,6 +15,7 @@ from rosrm.keys import key_files
 from rosrm.keys.finding import master_security
 from rosrm.ros import master_socket
 from rosrm.ros.master_connection import MasterClient
+from tests.programs import require
 from tests.ros.clusters import host, service
 from tests.waiting import PATIENCE
 
@@ -89,10 +90,8 @@ def test_a_command_on_the_machine_of_the_master_needs_no_dds(make_cluster) -> No
     done = rosrm(cluster, "ps")
     assert "walk" in done.stdout, done.stderr
     assert "rclpy" not in done.stderr
-    try:
-        elsewhere = rosrm(cluster, "ps", within=("unshare", "--net"))
-    except FileNotFoundError:
-        pytest.skip("needs unshare (package util-linux)")
+    require("unshare")
+    elsewhere = rosrm(cluster, "ps", within=("unshare", "--net"))
     if "Operation not permitted" in elsewhere.stderr:
         pytest.skip("a network namespace needs CAP_SYS_ADMIN")
     assert elsewhere.stdout == ""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import ssl
@@ -19,6 +18,7 @@ from websockets.sync.client import connect
 from rosrm.testing.local_cluster import claim_domain
 from rosrm.testing.loopback import settings_on_this_machine
 from rosrm_web.connections import MOST_CONNECTIONS
+from tests.programs import needs
 from tests.ros.web_kit import gateway
 from tests.waiting import PATIENCE, wait_until
 
@@ -179,7 +179,7 @@ def certificate(tmp_path):
     return names
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
+@needs("openssl")
 def test_https_with_tokens(ros, tmp_path, certificate):
     """The answers tell browsers to use HTTPS; a broken handshake disturbs no one."""
     tokens = tmp_path / "tokens"

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.programs import path_of, require
+
 #: Runs as the user: a counter goes through two images, and ends through its shim.
 HOPS = """
 import json, os, subprocess, sys, time
@@ -72,9 +74,9 @@ def test_a_process_of_an_unprivileged_user_is_restored(criu, as_nobody, public):
     if program.read_bytes()[:4] != b"\x7fELF":
         pytest.skip(f"{criu.command[0]} is a script, which can be given no capabilities")
     able = "cap_checkpoint_restore,cap_setpcap+eip"
-    setcap = shutil.which("setcap", path="/usr/sbin:/sbin:/usr/bin:/bin")
-    if setcap is None or subprocess.run([setcap, able, program], check=False).returncode != 0:
-        pytest.skip("no setcap, or no capabilities on this file system")
+    require("setcap")
+    if subprocess.run([path_of("setcap"), able, program], check=False).returncode != 0:
+        pytest.skip("no capabilities on this file system")
     done = as_nobody("-c", HOPS, program, public, home=public)
     assert done.returncode == 0, done.stderr
     code, namespace, numbers = json.loads(done.stdout)

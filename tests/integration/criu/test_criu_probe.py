@@ -16,6 +16,7 @@ import pytest
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.compatibility import FACTS
 from rosrm_criu.engine.probe import criu_support, probe
+from tests.programs import require
 from tests.waiting import wait_until
 
 
@@ -86,8 +87,9 @@ def test_what_the_user_reads_gives_the_rights(criu, as_nobody, public):
         as_nobody("-m", "rosrm_criu.engine.probe", home=public, ROSRM_CRIU=program).stdout
     )
     command = asked["reason"].split("`")[1].removeprefix("sudo ").split()
-    if shutil.which(command[0]) is None or subprocess.run(command, check=False).returncode != 0:
-        pytest.skip("no setcap, or no capabilities on this file system")
+    require(command[0])
+    if subprocess.run(command, check=False).returncode != 0:
+        pytest.skip("no capabilities on this file system")
     done = as_nobody("-m", "rosrm_criu.engine.probe", home=public, ROSRM_CRIU=program)
     able = json.loads(done.stdout)
     assert (able["works"], able["reason"]) == (True, "")
@@ -109,7 +111,7 @@ def test_root_of_a_container_reads_which_capability_is_missing(criu, added):
     bounds = f"-all,{DOCKER}{added}".replace(",", ",+")
     contained = ["setpriv", f"--bounding-set={bounds}", "--inh-caps=-all"]
     if subprocess.run([*contained, "true"], check=False).returncode != 0:
-        pytest.skip("no setpriv, or not all rights to give away")
+        pytest.skip("not all rights to give away")
     done = subprocess.run(
         [*contained, sys.executable, "-m", "rosrm_criu.engine.probe"],
         capture_output=True,

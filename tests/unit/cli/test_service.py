@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pwd
 import re
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -15,11 +14,10 @@ import pytest
 from rosrm.cli.commands import service
 from rosrm.cli.systemd_unit import needed_variables, unit_text
 from rosrm.errors import ConfigError
+from tests.programs import needs
 
 ME = pwd.getpwuid(os.geteuid()).pw_name
-with_systemd = pytest.mark.skipif(
-    shutil.which("systemd-analyze") is None, reason="this machine has no systemd-analyze"
-)
+with_systemd = needs("systemd-analyze")
 
 
 @pytest.fixture

@@ -8,7 +8,8 @@ from xml.etree import ElementTree as ET
 import pytest
 
 from rosrm.version import __version__
-from tests.cpp.core_library import PACKAGE, ROOT, compiler, run_compiler
+from tests.cpp.core_library import PACKAGE, ROOT, run_compiler
+from tests.programs import needs
 
 CMAKE = (PACKAGE / "CMakeLists.txt").read_text()
 MANIFEST = ET.parse(PACKAGE / "package.xml")
@@ -29,7 +30,7 @@ def test_the_manifest_names_what_the_build_needs():
     assert MANIFEST.findtext("version") == __version__
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C++ compiler here")
+@needs("g++")
 @pytest.mark.parametrize(
     "source",
     [
@@ -44,7 +45,7 @@ def test_what_needs_rclcpp_compiles_against_its_declarations(source):
     run_compiler("-fsyntax-only", str(source))
 
 
-@pytest.mark.skipif(compiler() is None, reason="no C++ compiler here")
+@needs("g++")
 def test_the_core_needs_no_ros(tmp_path):
     """Only `node.hpp` and `node.cpp` include files of ROS."""
     headers = sorted(PACKAGE.glob("include/rosrm_node_cpp/core/*.hpp"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import shutil
 import socket
 import ssl
 import subprocess
@@ -14,6 +13,7 @@ import pytest
 from rosrm_web import connections
 from rosrm_web.serving import http_server
 from rosrm_web.settings import Settings
+from tests.programs import needs
 from tests.waiting import PATIENCE
 
 #: A valid request, but for the empty line at its end.
@@ -175,7 +175,7 @@ def test_a_reader_that_takes_nothing_is_ended(monkeypatch):
     run(scene)
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="openssl makes the certificate")
+@needs("openssl")
 def test_a_handshake_that_never_ends_is_dropped(monkeypatch, tmp_path):
     """A handshake counts as a connection; a client that finishes it is answered."""
     monkeypatch.setattr(connections, "HEAD_TIMEOUT", 1.0)

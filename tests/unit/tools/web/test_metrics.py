@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -17,15 +16,13 @@ from rosrm.model.rows import EventRow, HostRow, Listing, ProcessRow, ResourceRow
 from rosrm.model.values import HostDescription
 from rosrm_web.metrics import counting, sampling, table
 from rosrm_web.metrics.exposition import exposition
+from tests.programs import needs
 
 ROOT = Path(__file__).resolve().parents[4]
 RULES = ROOT / "docs/how-to/rosrm.rules.yaml"
 DASHBOARD = ROOT / "docs/how-to/rosrm.grafana.json"
 METRICS = {one.name: one for one in (*table.PRESENT, *table.COUNTED)}
-needs_promtool = pytest.mark.skipif(
-    shutil.which("promtool") is None,
-    reason="no promtool, which Debian's package prometheus has (`.ci/run` installs it as root)",
-)
+needs_promtool = needs("promtool")
 #: Ends of the names of the series of a histogram.
 SERIES = re.compile(r"_(bucket|sum|count)$")
 
