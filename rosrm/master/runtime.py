@@ -83,8 +83,6 @@ _ANSWER: Final = 0.5
 _AT_ONCE: Final = 1.0
 #: Seconds of plugin calls in one turn; beyond this limit the core's clock is set back by them.
 _BLOCKED: Final = 0.5
-#: Seconds from which a suspend of this machine counts; the difference of two clocks is inexact.
-_SUSPENDED: Final = 0.1
 #: Seconds between two attempts to write the journal during a stall.
 _TRY_AGAIN: Final = 0.5
 _BOOT_ID: Final = Path("/proc/sys/kernel/random/boot_id")
@@ -147,7 +145,7 @@ class MasterRuntime:
         self._held: JournalStall | None = None
         self._deadlines = Deadlines(min(CALL_LIMIT, config.liveness.lease / 4.0))
         self._from_threads: deque[Callable[[], None]] = deque()
-        self._suspended = clocks.suspended_time()
+        self._suspends = clocks.Suspends()
         self._behind = 0.0  # seconds that the core's clock is behind: its start and blocked time
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
@@ -447,10 +445,9 @@ class MasterRuntime:
         The master received nothing in that time, so no host was silent, and no step was late. A
         host that lost the master fences by its own clock. Jobs end by the run times of their hosts.
         """
-        slept = clocks.suspended_time() - self._suspended
-        if slept < _SUSPENDED:
+        slept = self._suspends.new()
+        if not slept:
             return
-        self._suspended += slept
         if self._held is None:  # else the end of the stall sets the clock
             self._behind += slept
         _log.info("this machine was suspended for %.1f s", slept)

@@ -107,7 +107,7 @@ class PathCalls:
 
     def __init__(
         self, name: str, post: Callable[[Callable[[], None]], None], *,
-        clock: Callable[[], float] = clocks.boot_time,
+        clock: Callable[[], float] = clocks.awake_time,
     ) -> None:  # fmt: skip
         self._name, self._post, self._clock = name, post, clock
         self._lane: _Lane | None = None

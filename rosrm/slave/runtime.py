@@ -19,7 +19,14 @@ from rosrm import clocks
 from rosrm.config.reloading import OF_HOST, reloaded
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, reducer
-from rosrm.core.slave.events import DevicesMissed, Event, Registered, StartDelayed, TimePassed
+from rosrm.core.slave.events import (
+    DevicesMissed,
+    Event,
+    Registered,
+    Slept,
+    StartDelayed,
+    TimePassed,
+)
 from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
@@ -230,6 +237,7 @@ class SlaveRuntime:
         """Create participant and endpoint; return the view of the ROS graph."""
         config = self._config
         self._paths = PathCalls("paths of users", self._post)
+        self._suspends = clocks.Suspends()
         self._participant = Participant(config.ros, slave_node(config.host), pace="steady")
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
@@ -474,6 +482,13 @@ class SlaveRuntime:
             self._write_textfile(sample, now)
         self._take(TimePassed())
 
+    def _leave_out_suspend(self) -> None:
+        """Prolong what processes and fetches have to do in a time (see `rosrm.clocks`)."""
+        if slept := self._suspends.new():
+            _log.info("this machine was suspended for %.1f s", slept)
+            self._events.appendleft(Slept(slept))  # before a look at what is due
+            self._starter.leave_out(slept)
+
     def _write_textfile(self, sample: Sample, now: float) -> None:
         """Write metrics of this host for a node exporter."""
         listed = list(enumerate(one.name for one in self._sampler.resources))
@@ -583,6 +598,7 @@ class SlaveRuntime:
 
     def _work(self, now: float) -> None:
         """Pass all queued events to the core, and execute its commands."""
+        self._leave_out_suspend()
         self._paths.look()
         while self._from_threads:
             self._participant.guard.call(self._from_threads.popleft())

@@ -53,7 +53,7 @@ class Shutdown:
     supervisor_left: bool = False
     _supervisor_fault: str = field(init=False, default="")
     _is_informed: bool = field(init=False, default=False)
-    _kill_at: float = field(init=False, default=0.0)  # monotonic; 0.0: no stop began
+    _kill_at: float = field(init=False, default=0.0)  # awake time; 0.0: no stop began
 
     def note_supervisor_left(self, fault: str) -> None:
         """Note the end of the supervisor; without a fault it has stopped everything."""
@@ -136,8 +136,8 @@ class Shutdown:
         return code
 
     def _serve_for(self, seconds: float) -> None:
-        deadline = clocks.boot_time() + seconds
-        self.serve(lambda: not self.supervisor_left and clocks.boot_time() < deadline)
+        deadline = clocks.awake_time() + seconds
+        self.serve(lambda: not self.supervisor_left and clocks.awake_time() < deadline)
 
     def _kill(self, longest: float) -> None:
         """Kill what has not ended, whatever its `stop` was in the release that started it."""
@@ -169,12 +169,12 @@ class Shutdown:
         return min(max(longest, default=StopPolicy().timeout), LONGEST_STOP)
 
     def _next_kill(self) -> float:
-        """Return the latest monotonic time of SIGKILL; infinite if a `stop` is unknown."""
+        """Return the latest awake time of SIGKILL; infinite if a `stop` is unknown."""
         graces = [
             math.inf if stop is None else stop.interrupt_grace + stop.terminate_grace
             for stop in self._stops()
         ]
-        return clocks.boot_time() + max(graces, default=0.0)
+        return clocks.awake_time() + max(graces, default=0.0)
 
     def _stops(self) -> list[StopPolicy | None]:
         alive = self.state.alive.values()
@@ -182,7 +182,7 @@ class Shutdown:
 
     def _kill_after(self) -> str:
         """Return the end of a sentence with the time until SIGKILL; "": unknown, or it was sent."""
-        left = self._kill_at - clocks.boot_time()
+        left = self._kill_at - clocks.awake_time()
         if not 0.0 < left < math.inf:
             return ""
         return f"; processes that run after {math.ceil(left)} s are killed (SIGKILL)"

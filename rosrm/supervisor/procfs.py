@@ -139,13 +139,13 @@ def read_environment(pid: int) -> list[bytes]:
     Raises:
         OSError: the process has ended, may not be read by us, or its execve did not end.
     """
-    deadline = clocks.boot_time() + _EXECVE
+    deadline = clocks.awake_time() + _EXECVE
     while True:
         with open(f"/proc/{pid}/environ", "rb") as file:
             variables = file.read()
         if variables or _has_no_environment(pid):
             return variables.split(b"\0")
-        if clocks.boot_time() > deadline:
+        if clocks.awake_time() > deadline:
             raise TimeoutError(errno.ETIMEDOUT, f"its execve did not end within {_EXECVE:g} s")
         time.sleep(_LOOK)
 

@@ -100,6 +100,7 @@ class Server:
         self._selector = selectors.DefaultSelector()
         self._timer: BootTimer | None = None
         self._core = SupervisorState()
+        self._suspends = clocks.Suspends()
         self._confinement = Confinement(state)
         self._groups = self._confinement.groups
         self._starts: dict[int, _Start] = {}  # by pid, before the exec
@@ -150,6 +151,8 @@ class Server:
 
     def _round(self) -> None:
         """Do everything that is due, without waiting; no part needs the success of another one."""
+        if slept := self._suspends.new():
+            self._happened(events.Slept(slept))
         if self._is_due():
             # After a SIGSTOP of this process: messages that came in time count first.
             self._take_in(0.0)

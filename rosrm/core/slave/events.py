@@ -251,6 +251,13 @@ class TimePassed:
     """Time passed without another event; deadlines are checked."""
 
 
+@dataclass(frozen=True, slots=True)
+class Slept:
+    """This machine was suspended, in which no process could do anything."""
+
+    seconds: float
+
+
 Event = (
     Registered
     | MasterLost
@@ -275,4 +282,5 @@ Event = (
     | LookedAt
     | DevicesMissed
     | TimePassed
+    | Slept
 )

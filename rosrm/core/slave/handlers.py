@@ -548,6 +548,16 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
     return orders
 
 
+def _leave_out(state: SlaveState, event: events.Slept, _now: float) -> _Commands:
+    """Prolong what a process has to do in a time; fences and leases count the suspend."""
+    for held in state.held.values():
+        if held.ready_by is not None:
+            held.ready_by += event.seconds
+        if held.steering is not None:
+            held.steering.deadline += event.seconds
+    return []
+
+
 #: Handler of each event.
 HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
     {
@@ -574,5 +584,6 @@ HANDLERS: Final[Mapping[type, _Handler]] = MappingProxyType(
         events.LookedAt: _looked_at,
         events.DevicesMissed: _devices_missed,
         events.TimePassed: _time_passed,
+        events.Slept: _leave_out,
     }
 )

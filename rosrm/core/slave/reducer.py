@@ -35,6 +35,7 @@ DevicesMissed           ends each running instance as failed that holds a missin
 TimePassed              stops an instance that is not ready in time, ends one as failed whose
                         lifecycle transition takes too long, reports one that still waits to
                         start, refuses one whose fence expired before its start, and drops old ends
+Slept                   prolongs the time to be ready, and the time of a lifecycle transition
 ======================  =========================================================================
 """
 

@@ -167,6 +167,12 @@ class TimePassed(NamedTuple):
     """A deadline may have been reached."""
 
 
+class Slept(NamedTuple):
+    """This machine was suspended, in which no process could do anything."""
+
+    seconds: float
+
+
 class ShutdownOrdered(NamedTuple):
     """A client or a signal ordered to stop all instances and the supervisor."""
 
@@ -192,6 +198,7 @@ Event = (
     | SessionEnded
     | FencePassed
     | TimePassed
+    | Slept
     | ShutdownOrdered
     | ClientLost
 )

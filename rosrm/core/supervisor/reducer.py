@@ -31,6 +31,7 @@
               FailOrdered      SIGINT, or SIGKILL at once; then by policy    stopping
               AmendOrdered     -                                             running
     stopping  TimePassed       SIGTERM, then SIGKILL, then SIGKILL again     stopping
+              Slept            - (its grace is longer by the suspend)        stopping
               Exited           as intended (end, restart, policy)            exited, starting, ...
                                others of its session live: -                 stopping
               SessionEnded     as intended (end, restart, policy)            exited, starting, ...
@@ -160,6 +161,9 @@ class SupervisorState:
                     yield from self._apply(self.instances[key], event, now)
         elif isinstance(event, events.ContactReported):
             self._renew(min(event.at, now), min(event.alive, now))
+        elif isinstance(event, events.Slept):
+            for instance in list(self.instances.values()):
+                yield from self._apply(instance, event, now)
         elif isinstance(event, events.ShutdownOrdered):
             self.closing = True
             for instance in list(self.instances.values()):

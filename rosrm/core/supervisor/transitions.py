@@ -174,6 +174,17 @@ def _escalate(instance: Instance, event: events.Event, now: float) -> list[Comma
     return [ReportStatus(instance.key), Signal(instance.key, number)]
 
 
+def _leave_out(instance: Instance, event: events.Event, now: float) -> list[Command]:
+    """Prolong a grace by a suspend; the time by which a fenced instance must be gone stays."""
+    assert isinstance(event, events.Slept)
+    assert instance.deadline is not None
+    instance.stop_began += event.seconds
+    instance.deadline += event.seconds
+    if instance.kill_by is not None:
+        instance.deadline = min(instance.deadline, instance.kill_by)
+    return []
+
+
 def _restart_due(instance: Instance, event: events.Event, now: float) -> list[Command]:
     instance.restarts += 1
     instance.recent.append(now)
@@ -268,6 +279,7 @@ TRANSITIONS: Final[dict[tuple[Phase, type], Transition]] = {
     (RUNNING, events.AmendOrdered): _amend,
     (RUNNING, events.FailOrdered): _fail,
     (STOPPING, events.TimePassed): _escalate,
+    (STOPPING, events.Slept): _leave_out,
     (STOPPING, events.Exited): _exited,
     (STOPPING, events.SessionEnded): _cleared,
     (STOPPING, events.StopOrdered): _mean_to_end,

@@ -61,6 +61,10 @@ class Fetch:
         self._has_ended = True
         self._drop()
 
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the seconds of a suspend of this machine."""
+        self._progress_at += seconds
+
     def advance(self, now: float) -> None:
         """Request the next part, unless an answer or the disk is awaited."""
         if self._has_ended or self._incoming is None or self._is_complete:

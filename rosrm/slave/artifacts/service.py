@@ -103,6 +103,11 @@ class ArtifactService:
                 waits.reported_at = now
                 self._report(waits.assignment.instance, self._progress(waits, now))
 
+    def leave_out(self, seconds: float) -> None:
+        """Prolong all fetches by a suspend of this machine."""
+        for fetch in self._fetches.values():
+            fetch.leave_out(seconds)
+
     def _progress(self, waits: _Preparation, now: float) -> str:
         artifacts = {one.digest: one.size for one in waits.assignment.spec.artifacts}
         left, stalls = 0, set()

@@ -128,8 +128,8 @@ class Launchers:
         """Call one launcher, after its other calls; raises `PluginError` or `LaunchError`."""
         launcher: Any = self.made[name].launcher
         lock = self._locks.setdefault(name, threading.Lock())
-        began = self._since.get(name, clocks.boot_time())
-        if not lock.acquire(timeout=max(0.0, began + PREPARE_LIMIT - clocks.boot_time())):
+        began = self._since.get(name, clocks.awake_time())
+        if not lock.acquire(timeout=max(0.0, began + PREPARE_LIMIT - clocks.awake_time())):
             raise PluginError(
                 f"the launcher {name!r} fails: prepare: an earlier call has not ended"
             )
@@ -139,7 +139,7 @@ class Launchers:
             return None if prepared is None else _checked(launch, required(prepared, Launch))
 
         try:
-            self._since[name] = clocks.boot_time()
+            self._since[name] = clocks.awake_time()
             prepared = guarded(
                 ask, whom=titled("launcher", name), hook="prepare", seconds=PREPARE_LIMIT,
                 of=launcher, lets=(LaunchError, RosrmError, ValueError),

@@ -374,6 +374,11 @@ class Starter:
                     assignment.instance, path,
                 )  # fmt: skip
 
+    def leave_out(self, seconds: float) -> None:
+        """Prolong the fetches by a suspend of this machine."""
+        self.artifacts.leave_out(seconds)
+        self.replication.leave_out(seconds)
+
     def write_missing_keys(self) -> None:
         """Write the keys for which the disk had no room; called while it has some."""
         for instance in list(self._keyless):

@@ -52,6 +52,11 @@ class Fetch:
         """Ask for no further part; `ended` is not called."""
         self._has_ended = True
 
+    def leave_out(self, seconds: float) -> None:
+        """Do not count the seconds of a suspend of this machine."""
+        self._deadline += seconds
+        self._host_by += seconds
+
     def advance(self, now: float) -> None:
         """Ask for the next part, or try the next host if this one does not answer."""
         if self._has_ended:

@@ -153,6 +153,12 @@ class ReplicationService:
 
         self._jobs.put(job)
 
+    def leave_out(self, seconds: float) -> None:
+        """Prolong all fetches by a suspend of this machine."""
+        for fetch in self._preparing.values():
+            if fetch is not None:
+                fetch.leave_out(seconds)
+
     # --- requests of the master ----------------------------------------------------------
 
     def keep(self, instance: InstanceId, hosts: Sequence[str], every: float) -> None:

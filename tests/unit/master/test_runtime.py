@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from rosrm import clocks
 from rosrm.core.master import events as happened
 from rosrm.master import runtime
 from rosrm.master.runtime import MasterRuntime
@@ -51,7 +52,8 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
 def test_a_suspend_of_the_machine_makes_no_host_silent(monkeypatch, slept, passed) -> None:
     """The master heard nothing while it slept, and must not give up all hosts at its resume."""
     master = MasterRuntime.__new__(MasterRuntime)
-    master._behind, master._held, master._suspended = 0.0, None, 30.0
+    monkeypatch.setattr("rosrm.clocks.suspended_time", lambda: 30.0)
+    master._behind, master._held, master._suspends = 0.0, None, clocks.Suspends()
     before = master._core_now(100.0)
     monkeypatch.setattr("rosrm.clocks.suspended_time", lambda: 30.0 + slept)
     master._leave_out_suspend()

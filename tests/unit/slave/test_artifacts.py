@@ -227,6 +227,19 @@ def test_a_fetch_that_stalls_says_what_it_waits_for(host, offered, monkeypatch):
     assert "of 302 kB: the master does not answer (1" in host.reports[0]
 
 
+def test_a_suspend_ends_no_fetch(host, offered, monkeypatch):
+    """The time-out of a fetch counts the time in which a part could arrive."""
+    host.master.is_silent = True
+    instance = host.prepare(1, offered("model"))
+    host.run_until(lambda: host.master.asked, "a request")
+    slept = 10 * fetch.PATIENCE
+    host.service.leave_out(slept)
+    host.service.tick(clocks.boot_time() + slept + 1.0)
+    assert instance not in host.ended
+    host.service.tick(clocks.boot_time() + slept + fetch.PATIENCE + 1.0)
+    assert "was not fetched" in host.outcome(instance)
+
+
 def test_a_host_without_a_master_waits(host, offered, monkeypatch):
     """The fetch continues when the master returns."""
     monkeypatch.setattr(fetch, "PATIENCE", 0.2)

@@ -27,6 +27,7 @@ from rosrm.core.slave.events import (
     ReportRequested,
     RestartOrdered,
     SeenInGraph,
+    Slept,
     StartDelayed,
     StopOrdered,
     SupervisorReplaced,
@@ -282,6 +283,14 @@ def test_an_instance_that_does_not_become_ready_is_stopped_and_has_failed(node) 
     assert states([report]) == [STATE.FAILED]
     assert "not ready within 10 s" in report.statuses[0].message
     assert "/robot/n" in report.statuses[0].message
+
+
+def test_a_suspend_of_the_machine_prolongs_the_time_to_be_ready(node) -> None:
+    """The node did nothing in that time; at the resume it has what is left of its 10 s."""
+    assert node.step(TimePassed(), after=4.0) == []
+    assert node.step(Slept(3600.0), after=3600.0) == []
+    assert node.step(TimePassed(), after=5.9) == []
+    assert node.step(TimePassed(), after=0.2) == [Stop(NODE_1)]
 
 
 def test_a_run_that_is_ready_after_all_does_not_fail_for_its_late_readiness(node) -> None:

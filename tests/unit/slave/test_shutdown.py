@@ -62,7 +62,11 @@ class Slave:
 def slave(monkeypatch, caplog) -> Slave:
     caplog.set_level(logging.INFO)
     slave = Slave(caplog)
-    monkeypatch.setattr(shutdown, "clocks", SimpleNamespace(boot_time=lambda: slave.now))
+    monkeypatch.setattr(
+        shutdown,
+        "clocks",
+        SimpleNamespace(boot_time=lambda: slave.now, awake_time=lambda: slave.now),
+    )
     return slave
 
 

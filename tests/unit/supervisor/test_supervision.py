@@ -24,6 +24,7 @@ from rosrm.core.supervisor.events import (
     RestartOrdered,
     SessionEnded,
     ShutdownOrdered,
+    Slept,
     Spawned,
     SpawnFailed,
     StartOrdered,
@@ -793,3 +794,36 @@ class Host(RuleBasedStateMachine):
 
 Host.TestCase.settings = settings(max_examples=300, stateful_step_count=50, deadline=None)
 TestHost = Host.TestCase
+
+
+def test_a_suspend_prolongs_the_grace_of_a_stop():
+    """A process that was frozen with its machine has its whole grace to end in order."""
+    core, instance = started(stop=StopRule(interrupt_grace=10.0, terminate_grace=5.0))
+    core.handle(StopOrdered(TALKER), 100.0)
+    core.handle(Slept(3600.0), 3704.0)
+    assert core.deadline() == 3710.0
+    assert core.handle(TimePassed(), 3704.0) == []
+    assert kinds(core.handle(TimePassed(), 3710.0)) == ["ReportStatus", "Signal"]
+    assert "after 10.0 s" in instance.trail
+
+
+def test_a_suspend_prolongs_no_fence():
+    """Another instance may run by the time at which a fenced one must be gone."""
+    core = reducer.SupervisorState()
+    fence = FenceRule(after=20.0, grace=10.0)
+    core.handle(StartOrdered(TALKER, RestartRule(), StopRule(), fence), 0.0)
+    core.handle(Spawned(TALKER, 100), 0.0)
+    core.handle(StopOrdered(TALKER), 1.0)
+    core.handle(TimePassed(), 21.0)
+    must_be_gone = core.instances[TALKER].kill_by
+    core.handle(Slept(3600.0), 3622.0)
+    assert core.deadline() <= must_be_gone
+
+
+def test_a_suspend_delays_no_restart():
+    """A back-off gives way to others; nothing has to be done by the process in that time."""
+    core, _ = started(restart=RestartRule("always"))
+    core.handle(Exited(TALKER, 1), 0.0)
+    due = core.deadline()
+    core.handle(Slept(3600.0), 3600.0)
+    assert core.deadline() == due
