@@ -34,6 +34,6 @@ def test_an_operator_kills_what_ignores_its_stop(cluster) -> None:
 
 
 def test_a_process_that_would_stop_for_hours_is_refused(cluster) -> None:
-    """It would hold the stop of its slave."""
+    """Such a process would hold the stop of its slave."""
     with pytest.raises(Refused, match="600 s together"):
         cluster.submit(python("slow", DEAF, stop=StopPolicy(7_200_000.0)))

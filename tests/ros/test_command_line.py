@@ -295,7 +295,7 @@ def test_following_ends_with_ctrl_c(rosrm, words, says) -> None:
     ("words", "says"), [(("logs", "-f", "talker"), "hello"), (("events", "-f"), "counter")]
 )
 def test_following_ends_when_its_reader_has_gone(rosrm, words, says) -> None:
-    """As in `rosrm logs -f talker | grep -m1 hello`, also if no further line comes."""
+    """`rosrm logs -f talker | grep -m1 hello` ends, also if no further line comes."""
     with rosrm.follow(*words, says=says) as (process, _):
         process.stdout.close()
         assert process.wait(PATIENCE) == 1
@@ -328,7 +328,7 @@ def test_a_line_without_an_end_is_shown_in_a_terminal(rosrm, cluster) -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT])
 def test_a_signal_leaves_the_terminal_of_top_as_it_was(rosrm, number) -> None:
-    """With echo and cursor, for the shell that started it."""
+    """The terminal has echo and cursor again, for the shell that started the command."""
     rosrm.run("status")  # a master can be found in time now
     screen, inside = os.openpty()
     usual = termios.tcgetattr(inside)
@@ -377,7 +377,7 @@ def test_top_can_be_stopped_and_continued(rosrm) -> None:
 
 
 def test_a_command_in_a_removed_directory_works(rosrm, tmp_path) -> None:
-    """Where no path is absolute, for this command and for the libraries that it uses."""
+    """The command and its libraries have relative search paths, which lead nowhere."""
     gone = tmp_path / "gone"
     gone.mkdir()
     script = 'cd "$0"; rmdir "$0"; exec "$1" ps'

@@ -82,7 +82,7 @@ SECTIONS = [
 
 
 def test_each_node_of_a_process_gets_its_section_on_every_host(cluster, tmp_path) -> None:
-    """By its full name, and by `/**`, in the order of the files, also after a move."""
+    """The files name the node in full or by `/**`; their order decides, also after a move."""
     program = tmp_path / "several.py"
     program.write_text(SEVERAL_NODES)
     process = Process(

@@ -230,7 +230,7 @@ processes:
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGINT])
 def test_a_signal_that_the_starter_ignores_ends_nothing(terminal, number) -> None:
-    """As by `nohup`, or by a shell that starts a program with `&` in a script."""
+    """`nohup`, and a shell that starts a program with `&` in a script, ignore such signals."""
     former = signal.signal(number, signal.SIG_IGN)
     try:
         starts = started(terminal)

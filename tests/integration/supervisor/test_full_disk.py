@@ -46,7 +46,7 @@ def test_no_supervisor_ends_and_no_exit_code_is_lost(disk, host):
 
 
 def test_a_supervisor_starts_on_a_full_disk(disk, host):
-    """It takes over the processes of the former one, whose record it cannot replace."""
+    """The new one takes over the processes of the former one, whose record it cannot replace."""
     client = host.connect()
     pid = host.sleeper(client, "sleeps")
     disk.fill()

@@ -163,7 +163,7 @@ def test_a_key_that_finds_no_room_is_written_later(slave, tmp_path):
 
 
 def test_a_start_for_which_no_thread_is_left_is_refused(slave, monkeypatch):
-    """It waited for ever, or was tried again without a pause."""
+    """A start without a thread must neither wait for ever nor be tried again without a pause."""
     with monkeypatch.context() as without:
         without.setattr("rosrm.runtime.path_calls.MOST_LATE", 0)
         slave.launch(ProcessSpec("late", command=("true",)))

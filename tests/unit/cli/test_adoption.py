@@ -110,7 +110,7 @@ def test_a_program_that_is_not_found_by_its_word_is_the_file_that_runs() -> None
 
 
 def test_a_set_title_hides_the_arguments() -> None:
-    """It leaves empty words; a program with an empty last argument keeps its words."""
+    """A set title leaves empty words; a program with an empty last argument keeps its words."""
     keys = keys_of(facts("my robot: idle", "", ""))
     assert (keys["command"], keys.get("arguments")) == (["/usr/bin/program"], None)
     assert keys_of(facts("/bin/echo", "x", ""))["arguments"] == ["x", ""]

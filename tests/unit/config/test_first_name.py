@@ -42,7 +42,7 @@ def test_a_renamed_machine_keeps_its_host(machine, file, text) -> None:
 
 
 def test_a_name_in_the_file_is_the_name_of_the_host(machine, file) -> None:
-    """It is neither replaced by the first name of the machine, nor kept for it."""
+    """The first name of the machine does not replace that name, and rosrm keeps no note of it."""
     started(HostConfig())
     machine.host = "second"
     assert load_host(file("host: second")).host == "second"

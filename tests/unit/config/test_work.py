@@ -812,7 +812,7 @@ def test_a_variable_that_only_a_shell_replaces_is_refused(refusal, text):
 
 
 def test_a_variable_of_the_host_stands_in_variables_only(file, refusal):
-    """Also beside the values of `foreach`."""
+    """The values of `foreach` may stand beside them."""
     text = "processes: [{name: 'a{i}', foreach: {i: [1]}, command: x, KEY}]"
     ok = text.replace("KEY", "environment: {P: '/{i}:{env.P}', Q: 'a$ 5$'}")
     assert one(file(ok)).environment == {"P": "/1:{env.P}", "Q": "a$ 5$"}
@@ -821,6 +821,6 @@ def test_a_variable_of_the_host_stands_in_variables_only(file, refusal):
 
 
 def test_a_home_in_the_first_argument_is_refused_too(refusal):
-    """As in every further one; that of the program is replaced on the host."""
+    """No argument may have one; the host replaces a home in the program alone."""
     said = refusal(load_work, "processes: [{name: a, module: m, arguments: ~/maps}]")
     assert "'~' outside quotes" in said

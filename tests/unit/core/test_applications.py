@@ -600,7 +600,7 @@ def test_a_return_that_fails_again_and_again_is_tried_less_and_less() -> None:
 
 
 def test_a_process_that_is_cancelled_after_its_failed_return_does_not_start_again() -> None:
-    """It has nothing to return to any more."""
+    """The process has nothing to return to any more."""
     cluster = failed_return()
     cluster.machines["a"].refuses.clear()
     cluster.cancel("p")

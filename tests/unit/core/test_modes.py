@@ -255,7 +255,7 @@ def test_a_new_version_that_fails_ends_the_switch() -> None:
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_switch_that_fails_returns_to_the_mode_that_was_in_force(restarted: bool) -> None:
-    """Not to one that was being reached in between, also by another master."""
+    """The return does not lead to a mode that was only being reached, also after a restart."""
     slow = Mode("slow", (target("slow", node("late", readiness=Readiness(timeout=600.0))),))
     broken = Mode("broken", (target("broken", node("faulty")),))
     cluster = in_mode("docked", DOCKED, slow, broken)

@@ -486,7 +486,7 @@ def test_a_process_waits_until_an_unknown_label_is_reported() -> None:
 
 
 def test_a_process_is_not_separated_from_one_on_a_host_with_unknown_labels() -> None:
-    """It is not moved, either."""
+    """The master does not move the process, either."""
     cluster = cluster_of("abc", process("camera"))
     (on,) = cluster.where("camera")
     cluster.set_host(on, "cordon")

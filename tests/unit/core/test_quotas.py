@@ -176,7 +176,7 @@ def applied(cluster: Cluster, *targets: Target, plan: bool = False) -> Reply:
 @pytest.mark.parametrize("plan", [False, True])
 @pytest.mark.parametrize("command", [("run", "it"), ("new",)])
 def test_a_new_version_beyond_a_quota_is_refused(plan: bool, command: tuple[str, ...]) -> None:
-    """Whether its needs change in place or with a new start."""
+    """The same holds for a change in place and for a new start."""
     cluster = Cluster("a", quotas=MEMORY)
     assert applied(cluster, target("nav", process("p", 1024))).accepted
     cluster.wait(2.0)
@@ -205,7 +205,7 @@ def test_a_mode_beyond_a_quota_is_not_put_into_force() -> None:
 
 
 def test_a_process_that_its_application_has_yet_to_start_counts() -> None:
-    """It waits until a former instance of its name has ended."""
+    """The process waits until a former instance of its name has ended."""
     cluster = Cluster(Machine("a", stubborn={"p"}), quotas={"default": {"processes": 1}})
     assert applied(cluster, target("nav", process("p"))).accepted
     cluster.wait(1.0)
@@ -231,7 +231,7 @@ def test_the_version_to_which_a_failure_leads_back_counts() -> None:
 
 
 def test_a_request_that_raises_nothing_is_not_refused() -> None:
-    """Also where the quota is exceeded already, because an operator has lowered it."""
+    """The same holds where the quota is exceeded already, because an operator has lowered it."""
     cluster = Cluster("a", quotas=MEMORY)
     applied(cluster, target("nav", process("p", 3 * 1024), process("q", 512)))
     cluster.wait(2.0)
@@ -243,7 +243,7 @@ def test_a_request_that_raises_nothing_is_not_refused() -> None:
 
 @pytest.mark.parametrize("again", ["restart", "apply"])
 def test_ended_processes_that_start_again_count_for_the_limit_of_the_cluster(again: str) -> None:
-    """As submitted ones do."""
+    """Ended processes count as submitted ones do."""
     cluster = Cluster("a", max_processes=2)
     cluster.apply("nav", process("p", restart=RestartPolicy("never")))
     cluster.wait(1.0)
@@ -256,7 +256,7 @@ def test_ended_processes_that_start_again_count_for_the_limit_of_the_cluster(aga
 
 
 def test_a_gang_is_bounded_as_a_whole() -> None:
-    """By a restart, by several applications, and by a change in place."""
+    """A restart, several applications and a change in place are bounded, too."""
     many = [job(f"j{at}", together="g") for at in range(MOST_MEMBERS + 1)]
     cluster = Cluster("a")
     half = len(many) // 2

@@ -54,7 +54,7 @@ def play(cluster: Cluster, seconds: float) -> int:
 
 
 def test_the_wait_after_each_failure_in_a_row_doubles_up_to_the_longest() -> None:
-    """It is never shorter than the first."""
+    """No wait is shorter than the first."""
     backoff = Backoff()
     assert [backoff.note(0.0, 2.0, 10.0) for _ in range(5)] == [2.0, 4.0, 8.0, 10.0, 10.0]
     assert Backoff().note(0.0, 20.0, 10.0) == 20.0
@@ -82,7 +82,7 @@ def test_a_drain_does_not_restart_a_process_again_and_again() -> None:
 
 
 def test_a_host_is_drained_although_moves_off_it_have_failed() -> None:
-    """It says once what is left and why; the moves are tried again later."""
+    """An event says once what is left and why; the master tries the moves again later."""
     cluster = broken_beside()
     cluster.set_host("a", "drain")
     play(cluster, 3.0)

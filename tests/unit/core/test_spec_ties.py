@@ -43,7 +43,7 @@ def desired(cluster: Cluster) -> ProcessSpec:
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_former_version_that_returns_with_its_host_is_replaced(restarted: bool) -> None:
-    """It is re-adopted as what it is, also by another master, and the new version follows."""
+    """The master re-adopts the former version as such, and the new version follows."""
     cluster = lost()
     cluster.apply("nav", new(cluster["p"].spec))
     cluster.wait(5.0)
@@ -120,7 +120,7 @@ def test_changed_needs_change_the_reservation(before: int, after: int) -> None:
 
 
 def test_changed_needs_change_the_reservation_of_a_standby() -> None:
-    """It would run with the new needs once it takes over."""
+    """The standby would run with the new needs once it takes over."""
     machines = [Machine(name, memory=10 * GIB, busy=IDLE) for name in "ab"]
     cluster = Cluster(*machines)
     spec = stateful("p", standby=StandbyPolicy(wanted=True), needs={"memory": 1.0 * GIB})
@@ -239,7 +239,7 @@ def test_the_version_that_is_being_started_needs_no_action() -> None:
 
 
 def test_a_process_that_is_being_stopped_for_a_version_starts_with_the_newest() -> None:
-    """It does not start with the one in between."""
+    """The process does not start with the version in between."""
     cluster = Cluster(Machine("a", stubborn={"p"}))
     cluster.apply("nav", process("p"))
     cluster.wait(3.0)

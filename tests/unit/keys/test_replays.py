@@ -26,7 +26,7 @@ def user() -> KeyedLink:
 
 @on_dds
 def test_a_recorded_request_is_never_accepted_again() -> None:
-    """However many commands its user has run since; each has a run of its own."""
+    """The user may have run many commands since; each has a run of its own."""
     master = KeyedLink(KEY, bytes(RUN_BYTES), Direction.FROM_MASTER, Direction.TO_MASTER)
     recorded = user().seal(CHANNEL, b"list", b"run")
     assert master.open(CHANNEL, recorded, b"run") == b"list"

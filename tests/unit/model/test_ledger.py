@@ -16,7 +16,7 @@ actions = st.lists(
 
 @given(actions)
 def test_totals_are_the_sums_of_the_entries(found: list[tuple[str, int, int | None]]) -> None:
-    """Whatever is added, replaced and removed."""
+    """The sum is the same whatever is added, replaced and removed."""
     ledger, kept = Ledger[int](), dict[tuple[str, int], int]()
     for principal, key, size in found:
         if size is None:

@@ -95,5 +95,5 @@ def test_a_damaged_copy_is_named_by_the_file_beside_it(system, text, zone) -> No
 
 
 def test_a_machine_without_a_zone_has_utc(system) -> None:
-    """As in the C library."""
+    """The C library reads such a variable in the same way."""
     assert local_zone() == "UTC"

@@ -102,7 +102,7 @@ class SimulatedNode(Node):
     clock = 1000.0
 
     def simulates(self, seconds: float, rate: float, factor: float) -> str:
-        """As `looks`, while simulated time passes by a factor of real time."""
+        """Return looks as `looks` does, while simulated time passes by a factor of real time."""
         for _ in range(round(seconds / 0.2)):
             before, self.clock = self.clock, self.clock + 0.2 * factor
             self.now += 0.2

@@ -24,7 +24,7 @@ VALUES = SCALARS | st.lists(SCALARS, max_size=3) | st.just([[1]])
 @example(name="a", value=1e-05)
 @example(name="a", value=[0])
 def test_every_value_that_is_accepted_reaches_a_node(name, value):
-    """In the file of a process, and in the request for a component."""
+    """The file of a process and the request for a component both have them."""
     if parameter_fault(name, value):
         return
     read = yaml.safe_load(parameters_text({"/**": {name: value}}))

@@ -33,7 +33,7 @@ def modes_below(directory: Path) -> dict[str, int]:
 
 
 def test_the_outbox_of_alerts_is_private(tmp_path):
-    """With its journal, and with the directories that it makes; an older file is tightened."""
+    """The journal and the directories are private, too; an older file is tightened."""
     box = Outbox(tmp_path / "state" / "outbox")
     box.commit([], 7, {})
     box.close()
@@ -51,7 +51,7 @@ def test_an_outbox_that_is_a_fifo_is_refused(tmp_path):
 
 
 def test_a_report_is_private(tmp_path):
-    """It may have lines of logs; an older file of other rights is replaced."""
+    """A report may have lines of logs; an older file of other rights is replaced."""
     output = tmp_path / "report.html"
     output.touch(0o644)
     write_page(report(), output)

@@ -31,7 +31,7 @@ class Loop:
 
 
 def test_a_command_waits_for_one_listing_at_most() -> None:
-    """It comes before the other 199 listings of a viewer."""
+    """The command comes before the other 199 listings of a viewer."""
     loop = Loop()
     for number in range(200):
         loop.listing(VIEWER, f"listing {number}")

@@ -38,7 +38,7 @@ def test_a_session_ends_with_the_token_of_its_user():
 
 
 def test_another_gateway_knows_no_session_of_this_one():
-    """Nor does the next run; a token is no id of a session."""
+    """The next run does not, either; a token is no id of a session."""
     access = Access((ADA,))
     number = Sessions(access).begin(ADA)
     assert Sessions(access).user_of(number) is None
