@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
+from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
@@ -197,8 +198,10 @@ class ArtifactStore:
         """Remove what has arrived of an upload, if there is one."""
         upload = self._uploads.pop(key, None)
         if upload is not None:
-            os.close(upload.file)
-            upload.path.unlink(missing_ok=True)
+            with suppress(OSError):  # the first fault of a disk is the one to report
+                os.close(upload.file)
+            with suppress(OSError):
+                upload.path.unlink(missing_ok=True)
 
     # --- room ----------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from pathlib import Path
 
@@ -22,7 +23,7 @@ def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
             beginning + advice, f"the journal of the master cannot be used ({cause}); {advice}"
         )
 
-    if path.is_dir():
+    if os.path.isdir(path):  # noqa: PTH112 - unlike a Path it raises nothing
         return JournalError(f"{beginning}it is a directory: move it away, or {_OTHER_STATE}")
     if "full" in text or "No space" in text or "quota" in text:
         room = room_for(path)

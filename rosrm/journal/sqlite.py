@@ -114,7 +114,7 @@ class SqliteJournal:
     def _guarded(self, act: Callable[[], Any]) -> Any:
         try:
             return act()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             raise fault_of(self._path, error) from error
 
     @property

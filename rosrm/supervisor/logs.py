@@ -360,9 +360,11 @@ def rotate(path: str, size: int, limits: LogLimits) -> None:
                     _rename(f"{path}.{number}", f"{path}.{number + 1}")
                 _rename(f"{path}.new", f"{path}.1")
         finally:
-            _unlink(f"{path}.new")
+            # First, also if the copy failed, above all because the disk is full.
             written = os.fstat(log.fileno()).st_size
-            log.truncate(0)  # also when the copy failed, above all because the disk is full
+            log.truncate(0)
+            with contextlib.suppress(OSError):  # of the user, who may have made a folder of it
+                _unlink(f"{path}.new")
             log_index.begin(path, Mark(clocks.wall_time(), base + written, 0))
 
 

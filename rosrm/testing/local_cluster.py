@@ -326,7 +326,7 @@ def _end_all(parts: Sequence[Part]) -> None:
             part.process.wait(max(0.1, deadline - clocks.boot_time()))
         except subprocess.TimeoutExpired:
             part.end(signal.SIGKILL)
-            part.process.wait(5.0)
+            part.wait(5.0)  # one that a disk holds must not keep the others running
 
 
 def _brief(view: Listing) -> str:

@@ -87,11 +87,13 @@ class Terminal:
         with contextlib.suppress(OSError):  # a terminal without jobs, in which nothing stops
             if os.tcgetpgrp(self._descriptor) != os.getpgrp():
                 return
-        tty.setcbreak(self._descriptor)  # Ctrl-C stays a signal
+        with contextlib.suppress(termios.error):  # the terminal has gone
+            tty.setcbreak(self._descriptor)  # Ctrl-C stays a signal
 
     def _end(self) -> None:
         if self._descriptor is not None and self._before is not None:
-            termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
+            with contextlib.suppress(termios.error):  # it has gone, which ends the view
+                termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._before)
 
 
 def _exit(number: int, _frame: FrameType | None) -> None:

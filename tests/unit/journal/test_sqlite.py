@@ -446,3 +446,17 @@ def test_clients_read_the_cause_of_a_stall_without_a_path(tmp_path, fault) -> No
     assert str(tmp_path) not in error.public
     assert "/home" not in error.public
     assert error.public.startswith("the journal of the master cannot be used (")
+
+
+def test_a_journal_in_a_directory_that_refuses_a_look_is_blocked_and_no_crash(
+    tmp_path, monkeypatch
+) -> None:
+    """The fault concerns the path, so its description must not depend on a look at the path."""
+
+    def refuse(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "stat", refuse)
+    error = fault_of(tmp_path / "j.sqlite", sqlite3.OperationalError("unable to open database"))
+    assert isinstance(error, JournalBlocked)
+    assert "check owner and permissions" in str(error)

@@ -378,3 +378,12 @@ def test_a_log_of_a_former_owner_of_the_name_is_not_there(tmp_path, log) -> None
     assert refusal.value.code == "unknown"
     part = read_log(tmp_path, LogQuery(P.process, 5, first=4), ended=False)
     assert (part.content, part.numbers) == (b"new", (5,))
+
+
+def test_a_log_that_cannot_be_rotated_is_truncated_all_the_same(log) -> None:
+    """A process may make a folder of that name; its log must not fill the disk."""
+    log.write_bytes(LINES)
+    log.with_name(f"{log.name}.new").mkdir()
+    with pytest.raises(OSError, match="Is a directory"):
+        rotate(str(log), len(LINES), LogLimits())
+    assert log.stat().st_size == 0
