@@ -712,14 +712,14 @@ class Server:
 
 
 def _guarded(call: Callable[..., None], *args: object) -> None:
-    """Call a part of the loop; log a failure of the system that the part does not handle.
+    """Call a part of the loop; log a failure that the part does not handle.
 
-    A full or failing disk must not end the parent of all processes. The pause bounds the work if
-    the same failure follows at once.
+    Neither a full disk nor a bug in one part may end the parent of all processes. The pause bounds
+    the work if the same failure follows at once.
     """
     try:
         call(*args)
-    except OSError as fault:
+    except Exception as fault:  # noqa: BLE001 - see above
         own_log.write_fault(f"a part of the loop failed: {fault}")
         time.sleep(PAUSE_AFTER_FAULT)
 

@@ -50,7 +50,7 @@ from rosrm.core.supervisor.rules import FenceRule, Key, RestartRule, StopRule
 from rosrm.core.supervisor.transitions import TRANSITIONS, backoff
 from rosrm.model import values
 from rosrm.model.durations import LONGEST
-from rosrm.supervisor import messages
+from rosrm.supervisor import messages, server
 
 TALKER = ("talker", 7)
 
@@ -827,3 +827,12 @@ def test_a_suspend_delays_no_restart():
     due = core.deadline()
     core.handle(Slept(3600.0), 3600.0)
     assert core.deadline() == due
+
+
+def test_a_bug_in_a_part_of_the_loop_does_not_end_the_parent_of_all_processes(monkeypatch):
+    """The other parts go on, and the supervisor's own log has the traceback."""
+    notes = []
+    monkeypatch.setattr(server.own_log, "write_fault", notes.append)
+    monkeypatch.setattr(server, "PAUSE_AFTER_FAULT", 0.0)
+    server._guarded(lambda: 1 / 0)
+    assert notes == ["a part of the loop failed: division by zero"]

@@ -14,12 +14,12 @@ from rosrm import (
     EventRow,
     HostRow,
     Listing,
-    NoMaster,
     Notice,
     ProcessRow,
     clocks,
 )
 from rosrm.client.event_feed import EventFeed
+from rosrm.errors import ConfigError, RosrmError, describe_fault
 from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm.model.notices import notice_of
 from rosrm_alerts.alerts_file import AlertsFile
@@ -123,9 +123,12 @@ class AlertService:
         """Return the events that have not been seen; None: the master does not answer."""
         try:
             events = tuple(self._feed.new())
-        except NoMaster as error:
+        except ConfigError:
+            raise
+        except Exception as error:  # noqa: BLE001 - else no alert would tell that nothing answers
             if self._answers:
-                _log.warning("%s", error)
+                known = isinstance(error, RosrmError)
+                _log.warning("%s", error if known else describe_fault(error))
             self._answers = False
             return None
         if not self._answers:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from rosrm import NoMaster
+import pytest
+
+from rosrm import NoMaster, Refused
 from rosrm_alerts.conditions import Alert, NoAnswer
 from rosrm_alerts.service import AlertService
 
@@ -20,6 +22,37 @@ class Outbox:
 
     def commit(self, *_):
         return 0
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        NoMaster("no master answers"),
+        Refused("the master is of another version"),
+        OSError(24, "Too many open files"),
+        RuntimeError("failed to create a subscription"),
+    ],
+    ids=lambda fault: type(fault).__name__,
+)
+def test_whatever_prevents_a_listing_counts_as_no_answer(monkeypatch, fault) -> None:
+    """Otherwise the service would end, and no alert would tell that nothing is watched."""
+    boot = [1000.0]
+    monkeypatch.setattr("rosrm.clocks.boot_time", lambda: boot[0])
+
+    def connect():
+        raise fault
+
+    file = SimpleNamespace(alerts=[Alert("silent", NoAnswer(), lasts=3.0)], forwarded=())
+    service = AlertService(file, {}, Outbox(), connect)
+    begun = []
+    observe = service._watch.observe
+    monkeypatch.setattr(
+        service._watch, "observe", lambda *a: begun.extend(found := observe(*a)) or found
+    )
+    for _ in range(5):
+        boot[0] += 1.0
+        service._look()
+    assert [change.alert.name for change in begun] == ["silent"]
 
 
 def test_a_clock_that_is_set_neither_begins_nor_delays_an_alert(monkeypatch, caplog) -> None:
