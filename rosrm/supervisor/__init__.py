@@ -7,6 +7,7 @@
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
     spawn.py              start of one process: fork, and what its child does until the exec
+    spawn_error.py        failures of a spawn
     spawn_into.py         the fork into a control group of version 2
     exec_failures.py      reasons for programs that cannot be executed
     adoption.py           checks before a process that was started without rosrm is taken over

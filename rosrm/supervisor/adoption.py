@@ -14,7 +14,7 @@ from typing import Final
 from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.supervisor import procfs
 from rosrm.supervisor.procfs import Stat
-from rosrm.supervisor.spawn import SpawnError
+from rosrm.supervisor.spawn_error import SpawnError
 
 #: Modules of rosrm's own processes. A component container belongs to the user.
 _OWN_MODULES: Final = ("rosrm.cli", "rosrm.master", "rosrm.slave", "rosrm.supervisor")

@@ -12,7 +12,8 @@ from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime.signalling import send
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
-from rosrm.supervisor.spawn import TRANSIENT, Attempt, Scheduler, ScheduleRefused, SpawnError
+from rosrm.supervisor.spawn import TRANSIENT, Attempt, Scheduler
+from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
 from rosrm.wording import by_reason, listed
 
 #: In place of the descriptor of a control group.

@@ -10,7 +10,7 @@ import os
 import stat
 from typing import Final
 
-from rosrm.supervisor.spawn import SpawnError
+from rosrm.supervisor.spawn_error import SpawnError
 
 #: Most bytes of a secret; the kernel refuses a variable of 128 KiB or more.
 MOST_BYTES: Final = 1 << 16

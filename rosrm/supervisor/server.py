@@ -47,6 +47,7 @@ from rosrm.supervisor.json_lines import ProtocolError
 from rosrm.supervisor.logs import LogKeeper, LogLimits
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
+from rosrm.supervisor.spawn_error import SpawnError
 from rosrm.wording import listed
 
 #: Most starts before their exec at a time.
@@ -318,7 +319,7 @@ class Server:
             self._check_former_start(key)
             program = self._program(launch)
             log = self._open_log(key)
-        except spawn.SpawnError as error:
+        except SpawnError as error:
             self._spawn_failed(key, str(error), error.transient)
             return
 
@@ -346,7 +347,7 @@ class Server:
         for process, step in self._stuck.values():
             if process == key[0]:
                 message = f"a former start of it still waits for {step}, which does not answer"
-                raise spawn.SpawnError(message, transient=True)
+                raise SpawnError(message, transient=True)
 
     def _advance(self, start: _Start, step: Callable[[], spawn.Attempt]) -> None:
         """Continue a start, to its next attempt or to its end."""
@@ -355,7 +356,7 @@ class Server:
             start.attempt = step()
         except StopIteration as done:
             self._started(start, done.value)
-        except spawn.SpawnError as error:
+        except SpawnError as error:
             self._spawn_failed(start.key, str(error), error.transient)
         except OSError as error:
             self._spawn_failed(start.key, _no_room(error), transient=True)
@@ -374,7 +375,7 @@ class Server:
         self._stop_watching(start)
         try:
             start.attempt.check()
-        except (spawn.SpawnError, OSError) as error:
+        except (SpawnError, OSError) as error:
             fault = error
             self._advance(start, lambda: start.steps.throw(fault))
         else:
@@ -422,7 +423,7 @@ class Server:
         """Take over a process that runs, instead of the first start of an instance."""
         try:
             leader = adoption.check(rule, self._trees.owner_of)
-        except spawn.SpawnError as error:
+        except SpawnError as error:
             self._spawn_failed(key, str(error), error.transient)
             return
         if not self._trees.take_over(key, leader):
@@ -443,11 +444,11 @@ class Server:
             return self._logs.open(key, self._core.instances)
         except OSError as error:
             message = f"its log cannot be opened: {error.strerror}"
-            raise spawn.SpawnError(message, transient=True) from None
+            raise SpawnError(message, transient=True) from None
 
     def _program(self, launch: messages.Launch | None) -> spawn.Program:
         if launch is None:
-            raise spawn.SpawnError("its order was lost with a part of the record")
+            raise SpawnError("its order was lost with a part of the record")
         recorded = clocks.wall_time_ns()
         environment = start_trace.stamped_in(self._environment(launch), recorded=recorded)
         directory = launch.directory or paths.work_directory(self._state)
@@ -458,7 +459,7 @@ class Server:
     def _environment(self, launch: messages.Launch) -> dict[str, str]:
         base = self._environments.get(launch.environment)
         if base is None:
-            raise spawn.SpawnError(
+            raise SpawnError(
                 "its environment was lost with a damaged part of the record: it cannot be started "
                 "again by this order, only by a new one"
             )

@@ -16,6 +16,8 @@ import signal
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, NoReturn
 
+from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
+
 #: Seconds for the steps of one start; after them, the path of the current step has no answer.
 PATIENCE: Final = 10.0
 #: Errors that may pass: the same spawn is tried again where the restart policy allows.
@@ -28,24 +30,6 @@ _PART: Final = 1 << 16
 _STEP, _FAULT, _TRANSIENT_FAULT, _NO_SCHEDULE, _NO_GROUP = "@!~sg"
 #: Descriptor of the report in the child, the first one behind the standard ones.
 _REPORT: Final = 3
-
-
-class SpawnError(Exception):
-    """The process cannot be started; the text says what was tried, where, and what is wrong.
-
-    Only the first line is the reason: details such as a whole PATH go into further lines.
-
-    Attributes:
-        transient: the same spawn may succeed later.
-    """
-
-    def __init__(self, message: str, *, transient: bool = False) -> None:
-        super().__init__(message)
-        self.transient = transient
-
-
-class ScheduleRefused(SpawnError):
-    """The process may not have the real-time scheduling."""
 
 
 #: Real-time policy and parameters of a process.
@@ -227,7 +211,7 @@ def _execute(
     tell(_STEP, f"the working directory {directory!r}")
     _enter(directory)
     if program.secrets:
-        from rosrm.supervisor import secret_files  # noqa: PLC0415 - it imports this module
+        from rosrm.supervisor import secret_files  # noqa: PLC0415 - only secrets need it
 
         for name, path in program.secrets.items():
             tell(_STEP, f"the file {path!r} of the secret {name}")

@@ -15,7 +15,8 @@ from typing import Final
 from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
 from rosrm.errors import CriuError, LaunchError, PortableError
 from rosrm.ros.names import token
-from rosrm.supervisor.spawn import SpawnError, find_executable
+from rosrm.supervisor.spawn import find_executable
+from rosrm.supervisor.spawn_error import SpawnError
 from rosrm_criu.control.client import directory_of, make_control_root
 from rosrm_criu.control.messages import VARIABLE, State, Status, read_message
 from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_result, slots

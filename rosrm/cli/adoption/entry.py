@@ -15,8 +15,8 @@ from rosrm.cli.adoption.ros_words import RosWords
 from rosrm.errors import LaunchError
 from rosrm.model.rows import PluginRow
 from rosrm.slave.launch.ament_index import find_executable, search_path
-from rosrm.supervisor.spawn import SpawnError
 from rosrm.supervisor.spawn import find_executable as on_path
+from rosrm.supervisor.spawn_error import SpawnError
 
 _PYTHON: Final = re.compile(r"python[0-9.]*")
 #: Migration strategy that starts the program again, which any program allows.

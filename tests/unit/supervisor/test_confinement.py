@@ -20,7 +20,7 @@ from rosrm.supervisor import group_trees, instance_groups
 from rosrm.supervisor.confinement import Confinement
 from rosrm.supervisor.group_trees import Tree
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused, limit_files
-from rosrm.supervisor.spawn import ScheduleRefused, SpawnError
+from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
 from tests.starting import finish
 from tests.waiting import PATIENCE
 

@@ -7,7 +7,8 @@ import struct
 
 import pytest
 
-from rosrm.supervisor.spawn import Program, SpawnError, begin, find_executable
+from rosrm.supervisor.spawn import Program, begin, find_executable
+from rosrm.supervisor.spawn_error import SpawnError
 from tests.faults.disks import small_disk
 from tests.starting import executed
 
