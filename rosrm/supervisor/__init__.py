@@ -6,6 +6,7 @@
     boot_timer.py         timer of the boot clock, for the waits of the event loop
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
+    file_thread.py        file calls in a thread, because a directory may not answer
     spawn.py              start of one process: fork, and what its child does until the exec
     spawn_error.py        failures of a spawn
     spawn_into.py         the fork into a control group of version 2
@@ -22,6 +23,7 @@
     paths.py              the files in the supervisor's directory
     lease_file.py         the last contact with the master, for a restart
     logs.py, log_index.py the processes' log files: rotated, bounded, indexed by time
+    log_calls.py          the loop's side of these files
     own_log.py            the supervisor's own problems: supervisor.log
     messages.py           protocol between supervisor and slave, as json_lines.py
     discovery.py          lookup of the supervisor of a host, or its start

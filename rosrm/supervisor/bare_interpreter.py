@@ -11,6 +11,11 @@ from __future__ import annotations
 import os
 import sys
 
+#: Seconds after which a thread would ask the loop for the lock of the interpreter. None ever asks:
+#: `spawn_into` forks without the C library, so in the child the answer to that would wait for ever.
+#: The loop gives up the lock in each wait for events.
+_NEVER = 1000.0
+
 
 def main() -> None:
     """Listen in the state directory, report readiness, and serve until the shutdown."""
@@ -19,11 +24,12 @@ def main() -> None:
 
     # ruff: noqa: PLC0415 - these can be imported only now
     from rosrm.runtime import oom_score, timer_slack
-    from rosrm.supervisor import descriptors, endpoint
+    from rosrm.supervisor import descriptors, endpoint, own_log
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 
     state, *limits = sys.argv[1:]
+    sys.setswitchinterval(_NEVER)
     timer_slack.use_usual_timers()  # for the processes of users
     oom_score.protect()  # the slave, which cannot do it either then, logs why
     try:
@@ -33,6 +39,7 @@ def main() -> None:
     log_limits = LogLimits(*(int(limit) for limit in limits))
     server = Server(state, listener, log_limits, files=descriptors.raise_limit())
     endpoint.let_go_of_terminal(state)
+    own_log.use_thread(server.disk.begin)
     server.run()
 
 

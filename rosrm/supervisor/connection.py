@@ -77,7 +77,8 @@ class Connection:
     def finish(self, data: bytes, timeout: float) -> None:
         """Send the last bytes, waiting at most `timeout` seconds for the peer to read.
 
-        The connection stays open, because its end must mean the end of this process.
+        The connection stays open, because its end must mean the end of this process, as far as
+        others can wait for that.
         """
         self._peer.settimeout(timeout)
         try:

@@ -92,6 +92,7 @@ def let_go_of_terminal(state: str) -> None:
 
 def _lock(state: str) -> None:
     """Hold the lock until the process ends; the kernel releases it, even after a SIGKILL."""
+    global _lock_file  # noqa: PLW0603 - of the one lock
     file = open_private(os.path.join(state, paths.LOCK), os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -102,6 +103,15 @@ def _lock(state: str) -> None:
         ) from None
     # In place: on a full disk the room of a shortened file may be taken at once.
     os.pwrite(file, f"{os.getpid()}\n".ljust(_PID_BYTES).encode(), 0)
+    _lock_file = file
+
+
+_lock_file = -1
+
+
+def release_lock() -> None:
+    """Release the lock of `listen`, for a process whose end a disk may delay."""
+    os.close(_lock_file)
 
 
 def _bind(state: str) -> socket.socket:

@@ -12,6 +12,9 @@ The last line about an item counts. Each line survives the supervisor's own SIGK
 `write` passes it to the kernel. No line is forced to the disk, because after a loss of power none
 of the processes is left anyway. A tail torn by a full disk, or a damaged line, is skipped and
 reported in the notes.
+
+A thread writes (`file_thread`). Lines that the disk does not take yet wait in memory; many of them
+are replaced by the current state.
 """
 
 from __future__ import annotations
@@ -19,7 +22,8 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, NamedTuple
 
 from rosrm.core.supervisor.instance import (
     BACKOFF,
@@ -39,6 +43,7 @@ from rosrm.core.supervisor.rules import Key
 from rosrm.runtime import atomic_file
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import json_lines, messages, paths, procfs
+from rosrm.supervisor.file_thread import Call, FileThread
 from rosrm.supervisor.messages import Launch
 
 VERSION: Final = 1
@@ -215,20 +220,38 @@ _NEW_FIELDS: Final = frozenset(
 )
 
 
+class _Outcome(NamedTuple):
+    """Outcome of a write: what is still to be written, and why; "": it succeeded."""
+
+    rest: bytes
+    fault: str
+
+
 class InstanceRecord:
-    """Appends to the record; while the disk is full, lines are delayed but not lost.
+    """Appends to the record; while the disk takes nothing, lines are delayed but not lost.
+
+    Args:
+        state: the state directory.
+        disk: its thread.
 
     Attributes:
         trouble: reason of the last write's failure; "": it succeeded.
     """
 
-    def __init__(self, state: str) -> None:
+    def __init__(self, state: str, disk: FileThread) -> None:
         self.trouble = ""
         self._path = os.path.join(state, paths.RECORD)
+        self._disk = disk
+        self._waiting: list[bytes] = []
+        self._waiting_bytes = 0
+        self._compact_waiting_at = COMPACT_BYTES
+        self._is_whole = False  # the waiting lines replace the file, and all that was written
+        self._write: Call[_Outcome] | None = None  # without a known outcome
+        self._writes_whole = False
+        # Of the thread:
         self._file = -1
         self._size = 0
         self._compact_at = COMPACT_BYTES
-        self._waiting: list[bytes] = []
 
     def environment(self, identity: str, variables: Mapping[str, str]) -> None:
         """Add a base environment that launches refer to."""
@@ -253,27 +276,20 @@ class InstanceRecord:
 
     def flush(self) -> bool:
         """Pass all lines to the kernel in one write; return False, with `trouble`, if it failed."""
+        if not self._settle():
+            return False
         if not self._waiting:
             return True
-        try:
-            self._open_old()
-            text = b"".join(self._waiting)
-            written = os.write(self._file, text)
-        except OSError as error:
-            self._fail(error.strerror or str(error))
-            return False
-        self._size += written
-        if written < len(text):
-            self._waiting = [text[written:]]
-            self._fail("No space left on device, after a part of it")
-            return False
-        self._waiting.clear()
-        self.trouble = ""
-        return True
+        is_whole, self._is_whole = self._is_whole, False
+        text = self._take_waiting()
+        write = self._replace if is_whole else self._append
+        return self._begin(partial(write, text, text), is_whole=is_whole)
 
     def is_large(self) -> bool:
         """Return True if the record should be compacted by `rewrite`."""
-        return self._size >= self._compact_at
+        if self._waiting_bytes >= self._compact_waiting_at:
+            return True
+        return self._size >= self._compact_at and self._write is None
 
     def rewrite(
         self, core_state: SupervisorState, launches: Mapping[Key, Launch],
@@ -282,11 +298,11 @@ class InstanceRecord:
     ) -> None:  # fmt: skip
         """Replace the record by one that holds only the current state, if the disk has room.
 
-        The environments are all that launches refer to now or may later; one may be missing, where
-        a line was damaged.
+        While the disk takes nothing, replace only the waiting lines. The environments are all that
+        launches refer to now or may later; one may be missing, where a line was damaged.
         """
-        waiting = self._waiting
-        self._waiting = []
+        is_free = self._settle() and self._waiting_bytes < self._compact_waiting_at
+        waiting = self._take_waiting()
         self._add({"record": "header", "version": VERSION, "boot": procfs.boot_id()})
         for process, number in core_state.dead.items():
             self._add(
@@ -298,33 +314,71 @@ class InstanceRecord:
             self.launch(launch)
         for instance in core_state.instances.values():
             self.state(instance, birth(instance.key), kills(instance.key))
+        if is_free:
+            self._begin(partial(self._replace, self._take_waiting(), waiting), is_whole=False)
+        else:
+            self._is_whole = True
+            self._compact_waiting_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._waiting_bytes)
+
+    def _take_waiting(self) -> bytes:
         text = b"".join(self._waiting)
+        self._waiting, self._waiting_bytes = [], 0
+        return text
+
+    def _add(self, fields: Mapping[str, Any]) -> None:
+        line = json_lines.line(fields)
+        self._waiting.append(line)
+        self._waiting_bytes += len(line)
+
+    def _begin(self, write: Callable[[], _Outcome], *, is_whole: bool) -> bool:
+        self._write, self._writes_whole = self._disk.begin(write), is_whole
+        return self._settle()
+
+    def _settle(self) -> bool:
+        """Return True if no write is without an outcome; note the outcome of one that is over."""
+        if self._write is None:
+            return True
+        if not self._disk.ends(self._write):
+            self.trouble = f"{self._path} cannot be written: it does not answer"
+            return False
+        rest, fault = self._write.result()
+        self._write = None
+        self.trouble = f"{self._path} cannot be written: {fault}" if fault else ""
+        if self._is_whole:
+            return not fault  # the waiting lines replace what was written, and its rest
+        if fault:
+            self._waiting.insert(0, rest)
+            self._waiting_bytes += len(rest)
+            self._is_whole = self._writes_whole
+        else:
+            self._compact_waiting_at = COMPACT_BYTES
+        return not fault
+
+    # --- in the thread --------------------------------------------------------------------
+
+    def _append(self, text: bytes, _: bytes) -> _Outcome:
+        try:
+            if self._file < 0:  # the existing record, behind a tail that may be torn
+                self._file = open_private(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+                text = b"\n" + text
+            written = os.write(self._file, text)
+        except OSError as error:
+            return _Outcome(text, error.strerror or str(error))
+        self._size += written
+        rest = text[written:]
+        return _Outcome(rest, "No space left on device, after a part of it" if rest else "")
+
+    def _replace(self, text: bytes, waiting: bytes) -> _Outcome:
+        """Replace the file by a text; where that fails, `waiting` is still to be written."""
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * max(self._size, len(text)))
         try:
-            self._replace(text)
+            file = atomic_file.replace(self._path, text, os.O_APPEND)
         except OSError as error:
-            self._fail(error.strerror or str(error))
-            self._waiting = waiting
-            return
-        self._waiting = []
+            return _Outcome(waiting, error.strerror or str(error))
+        former, self._file = self._file, file
         self._size = len(text)
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._size)
-
-    def _replace(self, text: bytes) -> None:
-        file = atomic_file.replace(self._path, text, os.O_APPEND)
-        former, self._file = self._file, file
         if former >= 0:
             with contextlib.suppress(OSError):  # the lines that it had are in the new file
                 os.close(former)
-
-    def _open_old(self) -> None:
-        """Use the existing record if no other was made, behind a tail that may be torn."""
-        if self._file < 0:
-            self._file = open_private(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
-            self._waiting.insert(0, b"\n")
-
-    def _add(self, fields: Mapping[str, Any]) -> None:
-        self._waiting.append(json_lines.line(fields))
-
-    def _fail(self, why: str) -> None:
-        self.trouble = f"{self._path} cannot be written: {why}"
+        return _Outcome(b"", "")

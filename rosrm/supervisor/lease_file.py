@@ -14,14 +14,17 @@ from typing import Final
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import own_log, paths, procfs
+from rosrm.supervisor.file_thread import FileThread
 
 _NONE: Final = ContactReported(-inf, -inf)
 
 
 class LastContact:
-    """Stores the newest times."""
+    """Stores the newest times, in a thread."""
 
-    def __init__(self, state: str) -> None:
+    def __init__(self, state: str, disk: FileThread) -> None:
+        self._disk = disk
+        self._is_queued = False
         self._path = os.path.join(state, paths.HEARD)
         self._boot = procfs.boot_id()
         self._file = -1
@@ -34,6 +37,13 @@ class LastContact:
         if newest == self._newest:
             return
         self._newest = newest
+        if not self._is_queued:
+            self._is_queued = True
+            self._disk.tell(self._write)
+
+    def _write(self) -> None:
+        self._is_queued = False
+        newest = self._newest
         try:
             if self._file < 0:
                 self._file = open_private(self._path, os.O_WRONLY | os.O_CREAT)

@@ -72,8 +72,14 @@ class LogKeeper:
         self._opened: dict[Key, int] = {}
         self._prepared: dict[Key, int] = {}  # descriptors of logs that were opened ahead
         self._due: float | None = None
-        self._folder = LogFolder(state)
+        self._read_folder: LogFolder | None = None
         self._unchecked = limits.keep_bytes  # bytes that may lie there from earlier
+
+    @property
+    def _folder(self) -> LogFolder:
+        if self._read_folder is None:
+            self._read_folder = LogFolder(self._state)
+        return self._read_folder
 
     def prepare(self, instance: Key) -> None:
         """Open the log of an instance ahead of its start, for the next `open`.
@@ -287,7 +293,7 @@ class LogFolder:
         # again.
         if excess < PROCESSES_AT_ONCE or processes < self._left + PROCESSES_AT_ONCE:
             return
-        stay = {paths.safe_name(process) for process, _ in known}
+        stay = {paths.safe_name(process) for process, _ in tuple(known)}  # the loop may change it
         for name in [name for name in self._numbers if name not in stay][:excess]:
             for number in self._numbers.pop(name):
                 self._remove(name, number)

@@ -6,34 +6,65 @@ import contextlib
 import os
 import sys
 import time
+from collections import deque
+from collections.abc import Callable
 from typing import Final
 
 from rosrm.wording import printable
 
 #: Bytes beyond which the log is emptied.
 MOST_BYTES: Final = 1 << 20
+#: Most lines that wait for the disk.
+MOST_WAITING: Final = 100
 #: Descriptor of the standard error.
 _ERRORS: Final = 2
 
 
 def write(text: str) -> None:
-    """Write one line, with the time by this host's clock.
+    """Write one line, with the time by this host's clock; not at once after `use_thread`.
 
     The reports of a full disk come here, so a line that cannot be written is counted instead. The
     next line that can be written says how many are missing.
     """
-    global _missing  # noqa: PLW0603 - of the one log
-    lines = f"{_missing} lines before this one are missing: {_why}\n" if _missing else ""
-    line = printable(f"{time.strftime('%Y-%m-%dT%H:%M:%S')} {lines}{text}\n")
-    if _written(line):
-        _missing = 0
-        _empty_if_full()
-    else:
+    global _missing, _why  # noqa: PLW0603 - of the one log
+    if len(_waiting) >= MOST_WAITING:
         _missing += 1
+        _why = "the disk did not answer"
+        return
+    _waiting.append((time.strftime("%Y-%m-%dT%H:%M:%S"), text))
+    if len(_waiting) == 1:
+        _begin(_write_waiting)
+
+
+def use_thread(begin: Callable[[Callable[[], None]], object]) -> None:
+    """Write all further lines in a thread that `begin` hands calls to."""
+    global _begin  # noqa: PLW0603 - of the one log
+    _begin = begin
 
 
 _missing = 0
 _why = ""
+_waiting: deque[tuple[str, str]] = deque()
+
+
+def _at_once(work: Callable[[], None]) -> None:
+    work()
+
+
+_begin: Callable[[Callable[[], None]], object] = _at_once
+
+
+def _write_waiting() -> None:
+    global _missing  # noqa: PLW0603 - of the one log
+    while _waiting:
+        when, text = _waiting[0]
+        lines = f"{_missing} lines before this one are missing: {_why}\n" if _missing else ""
+        if _written(printable(f"{when} {lines}{text}\n")):
+            _missing = 0
+            _empty_if_full()
+        else:
+            _missing += 1
+        _waiting.popleft()
 
 
 def _written(line: str) -> bool:

@@ -1,7 +1,8 @@
 """Event loop of the supervisor: executes the commands of `rosrm.core.supervisor.reducer`.
 
-One thread. Each round: read input, let the core decide, record, spawn a few, send statuses. A
-status is recorded before it is sent; a spawn is recorded as imminent before it is tried.
+Each round: read input, let the core decide, record, spawn a few, send statuses. A status is
+recorded before it is sent, unless the disk takes nothing. A spawn is recorded as imminent before it
+is tried. Threads call the files: one those of the logs, one those of the state (`file_thread`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 from rosrm import clocks
@@ -29,8 +31,8 @@ from rosrm.runtime.signalling import send
 from rosrm.supervisor import (
     adoption,
     descriptors,
+    endpoint,
     lease_file,
-    logs,
     messages,
     own_log,
     paths,
@@ -41,10 +43,12 @@ from rosrm.supervisor import (
 from rosrm.supervisor.boot_timer import BootTimer
 from rosrm.supervisor.confinement import Confined, Confinement, Steps
 from rosrm.supervisor.connection import Connection
+from rosrm.supervisor.file_thread import LATE, FileThread, NoAnswer
 from rosrm.supervisor.instance_groups import LimitRefused
 from rosrm.supervisor.instance_record import InstanceRecord
 from rosrm.supervisor.json_lines import ProtocolError
-from rosrm.supervisor.logs import LogKeeper, LogLimits
+from rosrm.supervisor.log_calls import LogCalls
+from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm.supervisor.spawn_error import SpawnError
@@ -90,6 +94,9 @@ class Server:
         listener: socket for clients.
         limits: of the logs.
         files: soft limit of open descriptors of each process; None: that of the supervisor.
+
+    Attributes:
+        disk: thread of the state directory.
     """
 
     def __init__(
@@ -109,9 +116,10 @@ class Server:
             state, self._selector, self._happened, self._groups, self._reaped,
             lambda: {pid: start.key for pid, start in self._starts.items()},
         )  # fmt: skip
-        self._record = InstanceRecord(state)
-        self._last_contact = lease_file.LastContact(state)
-        self._logs = LogKeeper(state, limits)
+        self.disk = FileThread(state)
+        self._record = InstanceRecord(state, self.disk)
+        self._last_contact = lease_file.LastContact(state, self.disk)
+        self._logs = LogCalls(state, limits)
         self._null = _open_null()
         self._launches: dict[Key, messages.Launch] = {}
         self._environments: dict[str, dict[str, str]] = {}
@@ -169,6 +177,8 @@ class Server:
         self._record.flush()
         self._report()
         _guarded(self._prepare_held)
+        for disk in (self.disk, self._logs.disk):
+            disk.pass_on()
         if self._served and self._client is None and self._core.idle:
             self._leaving = True
 
@@ -177,10 +187,13 @@ class Server:
         return deadline is not None and deadline <= clocks.boot_time()
 
     def _timeout(self) -> float | None:
-        if self._spawns and self._room_for_starts():
+        late = self._late_disk()
+        if self._spawns and self._room_for_starts() and late is None:
             return 0.0
         parts = (self._core, self._logs, self._trees, self._groups)
         deadlines = [part.deadline() for part in parts]
+        if self._spawns and late is not None:
+            deadlines.append(clocks.boot_time() + LATE)
         if self._record.trouble:
             deadlines.append(clocks.boot_time() + RECORD_AGAIN)
         starts = self._starts.values()
@@ -201,9 +214,15 @@ class Server:
     def _leave(self) -> None:
         self._groups.close()
         with contextlib.suppress(OSError):  # the next supervisor replaces a socket that stays
-            os.unlink(os.path.join(self._state, paths.SOCKET))
+            self.disk.ask(partial(os.unlink, os.path.join(self._state, paths.SOCKET)))
         if self._client is not None:
             self._client.finish(messages.encode_ended(), END_PATIENCE)
+        with contextlib.suppress(OSError):  # writes the last lines of the own log, too
+            self.disk.ask(endpoint.release_lock)
+        if self._late_disk() is not None:  # its thread delays the end of this process
+            self._listener.close()
+            if self._client is not None:
+                self._client.close()
 
     # --- the core's commands ------------------------------------------------------------------
 
@@ -293,11 +312,15 @@ class Server:
 
     def _spawn_some(self) -> None:
         count = min(len(self._spawns), self._room_for_starts())
-        if not count:
+        if not count or self._waits_for_disk():
             return
         keys = [self._spawns.popleft() for _ in range(count)]
         self._record.spawning(keys)
         durable = self._record.flush()
+        if not durable and self.disk.is_late:
+            self._spawns.extendleft(reversed(keys))
+            return
+        delayed = []
         for key in keys:
             if not durable:
                 failed = f"not started, for it could not be recorded: {self._record.trouble}"
@@ -305,8 +328,26 @@ class Server:
                 continue
             try:
                 self._spawn(key)
+            except NoAnswer:
+                delayed.append(key)
             except OSError as error:
                 self._spawn_failed(key, _no_room(error), transient=True)
+        self._spawns.extendleft(reversed(delayed))
+
+    def _late_disk(self) -> FileThread | None:
+        """Return the thread of a directory that does not answer."""
+        return next((disk for disk in (self.disk, self._logs.disk) if disk.is_late), None)
+
+    def _waits_for_disk(self) -> bool:
+        """Return True if a directory is late; fail the starts if it is so for long."""
+        late = self._late_disk()
+        if late is not None and late.waits() > spawn.PATIENCE:
+            waiting = tuple(self._spawns)
+            self._spawns.clear()
+            failed = f"not started, for {late.directory} does not answer ({spawn.PATIENCE:g} s)"
+            for key in waiting:
+                self._spawn_failed(key, failed, transient=True)
+        return late is not None
 
     def _spawn(self, key: Key) -> None:
         launch = self._launches.get(key)
@@ -352,10 +393,11 @@ class Server:
     def _advance(self, start: _Start, step: Callable[[], spawn.Attempt]) -> None:
         """Continue a start, to its next attempt or to its end."""
         birth = procfs.ticks_now()
+        stamps = ""
         try:
             start.attempt = step()
         except StopIteration as done:
-            self._started(start, done.value)
+            stamps = self._started(start, done.value)
         except SpawnError as error:
             self._spawn_failed(start.key, str(error), error.transient)
         except OSError as error:
@@ -366,7 +408,7 @@ class Server:
             report = start.attempt.report
             self._selector.register(report, selectors.EVENT_READ, lambda: self._read_report(start))
             return
-        os.close(start.log)
+        self._logs.close(start.log, stamps)
 
     def _read_report(self, start: _Start) -> None:
         """Read a part of the report of a start, and continue the start at the end of the report."""
@@ -389,7 +431,7 @@ class Server:
     def _abandon(self, start: _Start) -> None:
         """Kill a process before its exec. It may end much later, so nothing waits for that."""
         self._stop_watching(start)
-        os.close(start.log)
+        self._logs.close(start.log)
         self._stuck[start.attempt.pid] = (start.key[0], start.attempt.step)
         send(start.attempt.pid, signal.SIGKILL)
 
@@ -408,16 +450,18 @@ class Server:
         if pid in self._starts:
             self._read_report(self._starts[pid])
 
-    def _started(self, start: _Start, confined: Confined) -> None:
-        """Report a start whose process executes its program."""
+    def _started(self, start: _Start, confined: Confined) -> str:
+        """Report a start whose process executes its program; return the trace for its log."""
         key, (pid, enforced, note) = start.key, confined
         environment = start.program.environment
+        stamps = ""
         if start_trace.VARIABLE in environment and not self._core.instances[key].started:
             traced = start_trace.stamped_in(environment, spawned=clocks.wall_time_ns())
-            logs.note_trace(start.log, traced[start_trace.VARIABLE])
+            stamps = traced[start_trace.VARIABLE]
         self._trees.add_child(key, pid, start.birth)
         self._logs.watch(key, clocks.boot_time(), pid)
         self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
+        return stamps
 
     def _adopt(self, key: Key, launch: messages.Launch, rule: AdoptionRule) -> None:
         """Take over a process that runs, instead of the first start of an instance."""
@@ -442,6 +486,8 @@ class Server:
     def _open_log(self, key: Key) -> int:
         try:
             return self._logs.open(key, self._core.instances)
+        except NoAnswer:
+            raise
         except OSError as error:
             message = f"its log cannot be opened: {error.strerror}"
             raise SpawnError(message, transient=True) from None
@@ -584,7 +630,7 @@ class Server:
             )
         self._client = connection
         self._served = True
-        self._logs.limits = hello.log
+        self._logs.limit(hello.log)
         self._unsent.clear()  # the welcome's statuses hold all of these changes
         self._first_starts.clear()
         now = clocks.boot_time()

@@ -2,6 +2,10 @@
 
 Python cannot do that, so this module calls the kernel. Where the kernel or a filter of system calls
 refuses clone3, the child enters the group itself, which takes some 10 ms from Linux 6.0 on.
+
+The parent may have further threads (`file_thread`). So the child makes new locks of the
+interpreter, as after `os.fork`. The locks of malloc are free in the child: each thread has an arena
+of its own, and uses that of the loop only with the interpreter's lock, which the loop has here.
 """
 
 from __future__ import annotations
@@ -29,6 +33,12 @@ class _CloneArguments(ctypes.Structure):
 # PyDLL keeps the lock of the interpreter during the call, so the child owns it.
 _libc = ctypes.PyDLL(None, use_errno=True)
 _libc.syscall.restype = ctypes.c_long
+_before, _in_child, _in_parent = (
+    ctypes.pythonapi.PyOS_BeforeFork, ctypes.pythonapi.PyOS_AfterFork_Child,
+    ctypes.pythonapi.PyOS_AfterFork_Parent,
+)  # fmt: skip
+for _call in (_before, _in_child, _in_parent):
+    _call.restype = None
 
 
 def fork_into(group: int) -> int | None:
@@ -43,7 +53,10 @@ def fork_into(group: int) -> int | None:
     wanted = _CloneArguments(
         flags=_CLONE_INTO_CGROUP, exit_signal=signal.SIGCHLD.value, cgroup=group
     )
-    pid = _libc.syscall(_CLONE3, ctypes.byref(wanted), ctypes.sizeof(wanted))
+    where, size = ctypes.byref(wanted), ctypes.sizeof(wanted)
+    _before()
+    pid = _libc.syscall(_CLONE3, where, size)
+    (_in_parent if pid else _in_child)()
     if pid >= 0:
         return int(pid)
     number = ctypes.get_errno()

@@ -20,6 +20,7 @@ from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 from rosrm.model.durations import LONGEST_STOP
 from rosrm.supervisor import endpoint, instance_record, messages, procfs, spawn, takeover
+from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.json_lines import ProtocolError, line
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.server import LONGEST_WAIT, Server
@@ -28,6 +29,7 @@ from tests.waiting import PATIENCE
 
 TEN_YEARS = 10 * 365.25 * 86400.0
 RESTART = ["always", 1.0, 30.0, 2.0, 5, 300.0]
+DISK = FileThread("the state directory", patience=PATIENCE)
 DEEP = b"[" * 100_000
 #: Values that a field of a damaged or hostile line may have.
 STRANGE = st.one_of(
@@ -169,7 +171,7 @@ def check_record(state):
     for instance in core.instances.values():
         messages.encode_status(messages.Status.of(instance, 0.0))
         core.handle(events.FencePassed(instance.key), clocks.boot_time())
-    record = instance_record.InstanceRecord(str(state))
+    record = instance_record.InstanceRecord(str(state), DISK)
     record.rewrite(core, recorded.launches, recorded.environments, lambda key: 0)
     assert record.trouble == ""
 

@@ -6,20 +6,26 @@ import pytest
 
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.supervisor import lease_file
+from rosrm.supervisor.file_thread import FileThread
+from tests.waiting import PATIENCE
+
+DISK = FileThread("the state directory", patience=PATIENCE)
 
 
 def test_the_newest_is_read_back(tmp_path):
     """The order in which the times arrived makes no difference."""
-    kept = lease_file.LastContact(str(tmp_path))
+    kept = lease_file.LastContact(str(tmp_path), DISK)
     for at, alive in ((5.0, 1.0), (123456789.25, 3.0), (7.0, 2.0)):
         kept.keep(ContactReported(at, alive))
+    DISK.ask(lambda: None)
     assert lease_file.read(str(tmp_path)) == ContactReported(123456789.25, 3.0)
     assert len((tmp_path / "heard").read_bytes().splitlines()) == 1
 
 
 def test_a_contact_of_another_boot_does_not_count(tmp_path, monkeypatch):
     """The clock of another boot does not compare."""
-    lease_file.LastContact(str(tmp_path)).keep(ContactReported(5.0))
+    lease_file.LastContact(str(tmp_path), DISK).keep(ContactReported(5.0))
+    DISK.ask(lambda: None)
     monkeypatch.setattr(lease_file.procfs, "boot_id", lambda: "another")
     assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
 
@@ -35,7 +41,8 @@ def test_an_unreadable_lease_file_does_not_count(tmp_path, content):
 def test_a_lease_file_that_cannot_be_written_is_logged_once(tmp_path, capfd):
     """Fences then rely on the contacts known to this supervisor."""
     (tmp_path / "heard").mkdir()
-    kept = lease_file.LastContact(str(tmp_path))
-    kept.keep(ContactReported(5.0))
-    kept.keep(ContactReported(6.0))
+    kept = lease_file.LastContact(str(tmp_path), DISK)
+    for at in (5.0, 6.0):
+        kept.keep(ContactReported(at))
+        DISK.ask(lambda: None)
     assert capfd.readouterr().err.count("heard cannot be written: Is a directory") == 1

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import json
 import os
+import threading
+import time
 
 import pytest
 
@@ -13,8 +15,11 @@ from rosrm.core.supervisor.instance import EXITED, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import LimitRule, RestartRule, RunLimits, StopRule
 from rosrm.supervisor import instance_record as rc
+from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.messages import Amend, Launch
+from tests.waiting import PATIENCE, wait_until
 
+DISK = FileThread("the state directory", patience=PATIENCE)
 TALKER = ("talker", 7)
 LAUNCH = Launch(TALKER, ("sleep", "1"), "base", {}, None, RestartRule(), StopRule(), "memo")
 
@@ -29,7 +34,7 @@ def core():
 
 @pytest.fixture
 def record(tmp_path, core):
-    record = rc.InstanceRecord(str(tmp_path))
+    record = rc.InstanceRecord(str(tmp_path), DISK)
     record.rewrite(core, {TALKER: LAUNCH}, {"base": {"A": "1"}}, lambda key: 55)
     return record
 
@@ -230,3 +235,67 @@ def test_a_compaction_without_room_leaves_no_part_of_itself(tmp_path, core, reco
     record.rewrite(core, {}, {}, lambda key: 0)
     assert "No space left" in record.trouble
     assert [path.name for path in tmp_path.iterdir()] == ["instances.jsonl"]
+
+
+@pytest.fixture
+def stuck():
+    """Return a thread whose calls wait, and a function that lets them go on."""
+    disk, gate = FileThread("the state directory", patience=0.1), threading.Event()
+
+    def hang() -> None:
+        disk.begin(gate.wait)
+
+    yield disk, hang, gate.set
+    gate.set()
+
+
+def test_a_disk_without_an_answer_delays_the_record_and_is_reported(tmp_path, core, stuck):
+    """The loop waits once, and the lines are in the file when the disk answers again."""
+    disk, hang, go_on = stuck
+    record = rc.InstanceRecord(str(tmp_path), disk)
+    record.rewrite(core, {TALKER: LAUNCH}, {}, lambda key: 55)
+    hang()
+    began = time.monotonic()
+    for second in range(100):
+        core.handle(events.Exited(TALKER, 3), float(second))
+        record.state(core.instances[TALKER], 0)
+        assert not record.flush()
+    assert time.monotonic() - began < 5.0
+    assert "instances.jsonl cannot be written: it does not answer" in record.trouble
+    go_on()
+    wait_until(record.flush, "the record is written")
+    assert record.trouble == ""
+    assert rc.read(str(tmp_path)).instances[TALKER].exit_code == 3
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_lines_that_wait_for_a_disk_are_bounded(tmp_path, core, stuck, monkeypatch, fails):
+    """The state replaces many lines, and later the file, also if the late write fails."""
+    disk, hang, go_on = stuck
+    monkeypatch.setattr(rc, "COMPACT_BYTES", 1 << 14)
+    record = rc.InstanceRecord(str(tmp_path), disk)
+    core.handle(events.StartOrdered(("other", 1), RestartRule(), StopRule()), 0.0)
+    record.rewrite(core, {TALKER: LAUNCH}, {}, lambda key: 55)
+    hang()
+    record.flush()
+    del core.instances["other", 1]
+    core.dead["other"] = 1
+    record.dead(("other", 1), 1)
+    for _ in range(1000):
+        record.state(core.instances[TALKER], 0)
+        assert not record.flush()
+        if record.is_large():
+            record.rewrite(core, {TALKER: LAUNCH}, {}, lambda key: 55)
+    assert sum(map(len, record._waiting)) < 1 << 17
+    core.handle(events.Exited(TALKER, 3), 2.0)
+    record.state(core.instances[TALKER], 0)
+    with monkeypatch.context() as patched:
+        if fails:
+            patched.setattr(os, "write", full)
+        go_on()
+        wait_until(lambda: not disk.is_late, "the disk answers")
+        record.flush()
+    wait_until(record.flush, "the record is written")
+    recorded = rc.read(str(tmp_path))
+    assert list(recorded.instances) == [TALKER]
+    assert recorded.instances[TALKER].exit_code == 3
