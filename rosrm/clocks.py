@@ -19,7 +19,8 @@ graces of a stop (SIGINT, SIGTERM), also those of a whole slave       awake time
 readiness, loads of components, transitions of a lifecycle node       awake time (`Slept`)
 fetch of an artifact or of a snapshot                                 awake time (`leave_out`)
 health: one look counts a bounded share of its time-out               awake time
-start that a path holds up; calls of plugins, launchers, probes       awake time
+start that a path holds up; wait for a directory of state or logs      awake time
+calls of plugins, launchers, probes                                   awake time
 ====================================================================  ======================
 """
 

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, Final
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 from rosrm import clocks, threads
 from rosrm.errors import RosrmError
@@ -35,6 +35,8 @@ _REMOTE: Final = (
 
 _this_thread = threading.local()
 
+T = TypeVar("T")
+
 
 class NoAnswer(RosrmError):
     """A path does not answer."""
@@ -51,21 +53,27 @@ def at(path: str | os.PathLike[str]) -> None:
         call.reach(str(Path(path).absolute()))
 
 
-class _Call:
-    """A call, and the path that it is at."""
+class PathCall:
+    """A call, and the path that it is at.
+
+    Attributes:
+        has_ended: no thread executes it any more, or will.
+    """
 
     def __init__(
         self, work: Callable[[], Any], then: Callable[[Any], None],
         failed: Callable[[Exception], None], late: Callable[[], None],
-        others: Callable[[], list[_Call]],
+        others: Callable[[], list[PathCall]],
     ) -> None:  # fmt: skip
         self.work, self.then, self.failed, self.late = work, then, failed, late
         self._others = others
         self.path = ""
         self.began = 0.0
         self.is_over = False
+        self.has_ended = False
 
     def reach(self, path: str) -> None:
+        """Note the path; raise `NoAnswer` if it is on a file system with a late call."""
         others = [one for one in self._others() if one is not self]
         mount = _remote_mount(path) if others else ""
         if mount and any(_remote_mount(one.path) == mount for one in others):
@@ -77,10 +85,10 @@ class _Lane:
     """A thread, its current call, and the calls behind it."""
 
     def __init__(
-        self, name: str, clock: Callable[[], float], finish: Callable[[_Call, Any], None]
+        self, name: str, clock: Callable[[], float], finish: Callable[[PathCall, Any], None]
     ) -> None:
-        self.calls: SimpleQueue[_Call | None] = SimpleQueue()
-        self.current: _Call | None = None
+        self.calls: SimpleQueue[PathCall | None] = SimpleQueue()
+        self.current: PathCall | None = None
         self._clock, self._finish = clock, finish
         threads.start(self._work, name, again=True)
 
@@ -93,6 +101,7 @@ class _Lane:
             except Exception as error:  # noqa: BLE001 - the loop handles it, and the thread lives on
                 outcome = partial(call.failed, error)
             self.current = None
+            call.has_ended = True
             self._finish(call, outcome)
 
 
@@ -116,13 +125,15 @@ class PathCalls:
     def run(
         self, work: Callable[[], Any], then: Callable[[Any], None],
         failed: Callable[[Exception], None], late: Callable[[], None] = lambda: None,
-    ) -> None:  # fmt: skip
+    ) -> PathCall:  # fmt: skip
         """Call `work` in a thread, then in the loop `then` with its result.
 
         If `work` raises, or is not over in time (`NoAnswer`), `failed` is called in the loop with
         the exception. Before that, `late` is called in the loop if the call takes a while.
         """
-        self._put(_Call(work, then, failed, late, self._late_calls))
+        call = PathCall(work, then, failed, late, self._late_calls)
+        self._put(call)
+        return call
 
     def look(self) -> None:
         """Find the calls that are late; the loop calls this several times a second."""
@@ -142,30 +153,86 @@ class PathCalls:
                 call.is_over = True
                 call.failed(NoAnswer(f"{call.path or 'it'} does not answer ({PATIENCE:g} s)"))
 
-    def _put(self, call: _Call) -> None:
+    def _put(self, call: PathCall) -> None:
         if len(self._late) >= MOST_LATE:
             paths = sorted({one.path for one in self._late_calls()})[:3]
             fault = NoAnswer(f"{MOST_LATE} calls wait for paths without an answer, e.g. {paths}")
+            call.has_ended = True
             self._post(partial(call.failed, fault))
             return
         if self._lane is None:
             try:
                 self._lane = _Lane(self._name, self._clock, self._finish)
             except RuntimeError as error:  # no thread can be started
+                call.has_ended = True
                 self._post(partial(call.failed, error))
                 return
         self._lane.calls.put(call)
 
-    def _late_calls(self) -> list[_Call]:
+    def _late_calls(self) -> list[PathCall]:
         return [call for lane in tuple(self._late) if (call := lane.current) is not None]
 
-    def _finish(self, call: _Call, outcome: Callable[[], None]) -> None:
+    def _finish(self, call: PathCall, outcome: Callable[[], None]) -> None:
         """Return an outcome to the loop, in the thread of the call."""
         self._post(lambda: None if call.is_over else outcome())
 
 
-def _taken(calls: SimpleQueue[_Call | None]) -> list[_Call]:
-    taken: list[_Call] = []
+class RunPath(Protocol):
+    """Signature of `PathCalls.run`."""
+
+    def __call__(
+        self, work: Callable[[], Any], then: Callable[[Any], None],
+        failed: Callable[[Exception], None],
+    ) -> PathCall:  # fmt: skip
+        """Call `work` in a thread, see `PathCalls.run`."""
+
+
+def run_at_once(
+    work: Callable[[], Any], then: Callable[[Any], None], failed: Callable[[Exception], None]
+) -> PathCall:
+    """Call `work` at once, where no loop has to go on."""
+    call = PathCall(work, then, failed, lambda: None, list)
+    call.has_ended = True
+    try:
+        outcome = work()
+    except Exception as error:  # noqa: BLE001 - as in a thread
+        failed(error)
+    else:
+        then(outcome)
+    return call
+
+
+class NewestWrite(Generic[T]):
+    """Writes the newest of some values; while the path does not answer, a value replaces the last.
+
+    A failed write is not repeated.
+
+    Args:
+        run: as `PathCalls.run`.
+        write: writes a value, in a thread.
+    """
+
+    def __init__(self, run: RunPath, write: Callable[[T], None]) -> None:
+        self._run, self._write = run, write
+        self._values: list[T] = []
+        self._call: PathCall | None = None
+
+    def put(self, value: T) -> None:
+        """Write a value, now or when the path answers."""
+        self._values[:] = [value]
+        self._begin()
+
+    def _begin(self) -> None:
+        if self._values and (self._call is None or self._call.has_ended):
+            write = partial(self._write, self._values.pop())
+            self._call = self._run(write, self._continue, self._continue)
+
+    def _continue(self, _: object) -> None:
+        self._begin()
+
+
+def _taken(calls: SimpleQueue[PathCall | None]) -> list[PathCall]:
+    taken: list[PathCall] = []
     while True:
         try:
             call = calls.get_nowait()

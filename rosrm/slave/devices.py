@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from rosrm.model.devices import MOST_DEVICES, Device
+from rosrm.runtime.path_calls import PathCall, RunPath, at
 from rosrm.wording import listed, sanitized
 
 _log = logging.getLogger("rosrm.slave")
@@ -18,6 +20,43 @@ _log = logging.getLogger("rosrm.slave")
 LOOK_PERIOD: Final = 1.0
 
 _Units = Mapping[str, Device]
+
+
+def file_fault(path: str) -> str:
+    """Return why the file of a device is not there; "": it is."""
+    try:
+        at(path)
+        Path(path).stat()
+    except OSError as error:
+        return f"{path}: {error.strerror or error}"
+    return ""
+
+
+class FileFaults:
+    """Faults of the files of devices, looked at in a thread, because a file may not answer.
+
+    Args:
+        run: as `PathCalls.run`.
+        changed: called in the loop after a fault has changed.
+    """
+
+    def __init__(self, run: RunPath, changed: Callable[[], None]) -> None:
+        self._run, self._changed = run, changed
+        self._faults: dict[str, str] = {}
+        self._looks: dict[str, PathCall] = {}
+
+    def __call__(self, path: str) -> str:
+        """Return the newest known fault of a file, and begin to look at the file again."""
+        if path not in self._looks or self._looks[path].has_ended:
+            seen = partial(self._seen, path)
+            self._looks[path] = self._run(partial(file_fault, path), seen, lambda it: seen(str(it)))
+        return self._faults.get(path, "")
+
+    def _seen(self, path: str, fault: str) -> None:
+        before = self._faults.get(path, "")
+        self._faults[path] = fault
+        if fault != before:
+            self._changed()
 
 
 class DeviceWatch:
@@ -38,13 +77,16 @@ class DeviceWatch:
         self.devices: tuple[Device, ...] = ()
         self.lost: Mapping[tuple[str, str], str] = {}
 
-    def look(self, found: Mapping[str, tuple[Device, ...]]) -> bool:
+    def look(
+        self, found: Mapping[str, tuple[Device, ...]], fault_of: Callable[[str], str] = file_fault
+    ) -> bool:
         """Look at each device once, and log changes; return True if there are any.
 
         Args:
             found: name of each probe to the devices that it found last.
+            fault_of: returns the fault of a file; "": it is there.
         """
-        before, self.devices = self.devices, tuple(self._all(found))[:MOST_DEVICES]
+        before, self.devices = self.devices, tuple(self._all(found, fault_of))[:MOST_DEVICES]
         missing = {(one.kind, one.unit) for one in before if one.missing}
         _log_changes(self.devices, missing)
         self.lost = {
@@ -54,16 +96,19 @@ class DeviceWatch:
         }
         return self.devices != before
 
-    def _all(self, found: Mapping[str, tuple[Device, ...]]) -> Iterator[Device]:
+    def _all(
+        self, found: Mapping[str, tuple[Device, ...]], fault_of: Callable[[str], str]
+    ) -> Iterator[Device]:
         by_kind: dict[str, dict[str, Device]] = {}
         for devices in found.values():
             for device in devices:
                 by_kind.setdefault(device.kind, {}).setdefault(device.unit, device)
         for kind, configured in self.configured.items():
-            yield from _checked(_joined(one, by_kind.get(kind)) for one in configured)
+            joined = (_joined(one, by_kind.get(kind)) for one in configured)
+            yield from _checked(joined, fault_of)
         for kind, units in by_kind.items():
             if kind not in self.configured:
-                yield from _checked(units.values())
+                yield from _checked(units.values(), fault_of)
 
 
 def _log_changes(devices: Iterable[Device], missing: AbstractSet[tuple[str, str]]) -> None:
@@ -85,16 +130,8 @@ def _joined(device: Device, found: _Units | None) -> Device:
     return replace(device, path=device.path or other.path, about=other.about, missing=other.missing)
 
 
-def _checked(devices: Iterable[Device]) -> Iterator[Device]:
+def _checked(devices: Iterable[Device], fault_of: Callable[[str], str]) -> Iterator[Device]:
     """Yield the devices; one whose file is not there is missing."""
     for device in devices:
-        fault = device.missing or (_file_fault(device.path) if device.path else "")
+        fault = device.missing or (fault_of(device.path) if device.path else "")
         yield device if fault == device.missing else replace(device, missing=sanitized(fault))
-
-
-def _file_fault(path: str) -> str:
-    try:
-        Path(path).stat()
-    except OSError as error:
-        return f"{path}: {error.strerror or error}"
-    return ""

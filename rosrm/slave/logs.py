@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -38,10 +39,13 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool, pid: int = 
 
     Args:
         state_directory: of the supervisor.
-        query: with the number of the instance.
+        query: number 0 is that of the newest instance with a log here.
         ended: the instance has ended.
         pid: of its process; 0: unknown.
     """
+    if not query.number:
+        newest = newest_instance(state_directory, query.process)
+        query = replace(query, number=newest.number)
     instance = InstanceId(query.process, query.number)
     path = log_path(state_directory, instance)
     missing = Refused(f"this host has no log of {instance} (any more)", "unknown")

@@ -64,12 +64,12 @@ from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import end_start, handle_signals
-from rosrm.runtime.path_calls import PathCalls
+from rosrm.runtime.path_calls import PathCalls, at
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.devices import LOOK_PERIOD as LOOK_AT_DEVICES
-from rosrm.slave.devices import DeviceWatch
+from rosrm.slave.devices import DeviceWatch, FileFaults
 from rosrm.slave.epoch import EPOCH_NOTE, EpochNote
 from rosrm.slave.executors import Done, Executors
 from rosrm.slave.health import HealthWatch
@@ -80,15 +80,16 @@ from rosrm.slave.launch.lanes import Lanes
 from rosrm.slave.launch.launchers import ASK_LIMIT, PREPARE_LIMIT, Launchers
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.links import LinkProber
-from rosrm.slave.logs import newest_instance, nothing_yet, read_log
+from rosrm.slave.logs import nothing_yet, read_log
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sample, Sampler
 from rosrm.slave.sessions import SessionTable
 from rosrm.slave.shutdown import STOP_ALL, Shutdown
-from rosrm.slave.state_disk import StateDisk
+from rosrm.slave.state_disk import DiskWatch
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.slave.textfile import HostMetrics, Textfile
 from rosrm.slave.usage import UsageWatch
+from rosrm.supervisor.paths import log_folder
 from rosrm.version import __version__
 from rosrm.wording import by_reason, counted, reload_summary, signal_name
 
@@ -238,13 +239,14 @@ class SlaveRuntime:
         config = self._config
         self._paths = PathCalls("paths of users", self._post)
         self._suspends = clocks.Suspends()
+        self._device_faults = FileFaults(self._paths.run, self._look_at_devices)
         self._participant = Participant(config.ros, slave_node(config.host), pace="steady")
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
         self._endpoint = SlaveEndpoint(
             self._endpoints, self._description(), self._state, take=self._take,
             snapshots=lambda: self._replication.states(),  # noqa: PLW0108 - made later
-            seen=JournalWatermark(config.state / "journal_seen"),
+            seen=JournalWatermark(config.state / "journal_seen", self._paths.run),
         )  # fmt: skip
         return GraphWatch(self._participant.node)
 
@@ -258,8 +260,12 @@ class SlaveRuntime:
     def _serve_master(self, max_age: float) -> None:
         """Offer the services of this slave, with those of snapshot replication."""
         config = self._config
-        self._state_disk = StateDisk(self._paths, config.state, self._note_disk)
-        self._epoch_note = EpochNote(config.state / EPOCH_NOTE)
+        self._disks = [DiskWatch(self._paths.run, config.state, "state directory", self._note_disk)]
+        self._logs = Path(log_folder(str(self._supervisor.state))).resolve()  # it may be a link
+        if self._logs.stat().st_dev != config.state.stat().st_dev:
+            other = DiskWatch(self._paths.run, self._logs, "log directory", self._note_disk)
+            self._disks.append(other)
+        self._epoch_note = EpochNote(config.state / EPOCH_NOTE, self._paths.run)
         self._replication = ReplicationService(
             self._snapshots, config.host, config.keep,
             ReplicationEndpoint(self._endpoints, config.host),
@@ -413,7 +419,7 @@ class SlaveRuntime:
 
     def _look_at_devices(self) -> None:
         """Report changes of the devices to the master, and lost ones to the core."""
-        if self._devices.look(self._sampler.devices):
+        if self._devices.look(self._sampler.devices, self._device_faults):
             self._endpoint.set_devices(self._devices.devices)
         if self._devices.lost:
             self._take(DevicesMissed(self._devices.lost))
@@ -458,7 +464,8 @@ class SlaveRuntime:
     def _cycle(self, now: float) -> None:
         """Do the work that is due at the rate of `resource_info`."""
         self._participant.guard.call(self._settings_check.poll)
-        self._state_disk.look(now)
+        for disk in self._disks:
+            disk.look(now)
         self._note_part("supervisor", self._supervisor.trouble(now))
         self._endpoint.advance(now)
         self._epoch_note.note(self._endpoint.epoch)
@@ -514,9 +521,9 @@ class SlaveRuntime:
                 else:
                     failing.pop(("probe", resource), None)
 
-    def _note_disk(self, fault: str) -> None:
-        """Report whether the state directory takes data."""
-        self._note_part("state directory", fault)
+    def _note_disk(self, part: str, fault: str) -> None:
+        """Report whether a directory takes data."""
+        self._note_part(part, fault)
         if not fault:
             self._starter.write_missing_keys()
 
@@ -680,25 +687,29 @@ class SlaveRuntime:
         )
         self._replication.drop(instance, lives=lives)
 
-    def _read_log(self, query: LogQuery) -> LogPart:
-        """Return a part of a log; raises `Refused`."""
+    def _read_log(self, query: LogQuery, done: Callable[[LogPart | Refused], None]) -> None:
+        """Read a part of a log in a thread; call `done` with it, or why there is none."""
         if not query.number:
-            query = replace(query, number=self._newest_instance(query.process).number)
+            numbers = [one.number for one in self._state.held if one.process == query.process]
+            query = replace(query, number=max(numbers, default=0))
         held = self._state.held.get(InstanceId(query.process, query.number))
         ended = held is None or held.status.state.ended
-        try:
-            pid = 0 if held is None else held.status.pid
-            return read_log(self._supervisor.state, query, ended=ended, pid=pid)
-        except Refused:
-            if ended:
-                raise
-            return nothing_yet(query)
+        pid = 0 if held is None else held.status.pid
 
-    def _newest_instance(self, process: str) -> InstanceId:
-        held = [one.number for one in self._state.held if one.process == process]
-        if held:
-            return InstanceId(process, max(held))
-        return newest_instance(self._supervisor.state, process)
+        def failed(error: Exception) -> None:
+            if isinstance(error, Refused) and not ended:
+                done(nothing_yet(query))
+            elif isinstance(error, Refused):
+                done(error)
+            else:
+                why = str(error).replace(str(self._config.state), "STATE")
+                done(Refused(f"the log of {query.process} cannot be read: {why}", "unable"))
+
+        def read() -> LogPart:
+            at(self._logs)
+            return read_log(self._supervisor.state, query, ended=ended, pid=pid)
+
+        self._paths.run(read, done, failed)
 
     def _execute(self, order: RunExecutor, done: Done) -> None:
         """Run an executor in a thread of its own; raises `Refused`."""

@@ -1,4 +1,4 @@
-"""Watch of the disk of the state directory: full, read-only, failing, or without an answer."""
+"""Watch of the disks of state and logs: full, read-only, failing, or without an answer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-from rosrm.runtime.path_calls import PathCalls, at
+from rosrm.runtime.path_calls import PathCall, RunPath, at
 
 #: Seconds between two looks.
 PERIOD: Final = 5.0
@@ -23,6 +23,7 @@ def fault_of(directory: Path) -> str:
     """Return why nothing can be written to a directory's disk; "": it can."""
     at(directory)
     try:
+        os.statvfs(directory)  # asks a server, unlike a file without a name, which few of them have
         file = os.open(directory, os.O_TMPFILE | os.O_WRONLY | os.O_CLOEXEC, 0o600)
     except OSError as error:
         return "" if error.errno in _NO_NAMELESS else error.strerror or str(error)
@@ -35,28 +36,31 @@ def fault_of(directory: Path) -> str:
     return "" if written == ROOM else os.strerror(errno.ENOSPC)
 
 
-class StateDisk:
-    """Looks at the disk of a state directory in a thread.
+class DiskWatch:
+    """Looks at the disk of a directory in a thread.
 
     Args:
-        paths: the threads.
-        directory: the state directory.
-        note: called in the loop after each look with the fault; "": there is none.
+        run: as `PathCalls.run`.
+        directory: that is watched.
+        part: name of the directory.
+        note: called in the loop after each look with the name and the fault; "": there is none.
     """
 
-    def __init__(self, paths: PathCalls, directory: Path, note: Callable[[str], None]) -> None:
-        self._paths, self._directory, self._note = paths, directory, note
+    def __init__(
+        self, run: RunPath, directory: Path, part: str, note: Callable[[str, str], None]
+    ) -> None:
+        self._run, self._directory, self._part, self._note = run, directory, part, note
         self._due = 0.0
-        self._looks = False
+        self._look: PathCall | None = None
 
     def look(self, now: float) -> None:
         """Begin a look if one is due, and none is under way."""
-        if now < self._due or self._looks:
+        if now < self._due or not (self._look is None or self._look.has_ended):
             return
-        self._due, self._looks = now + PERIOD, True
+        self._due = now + PERIOD
         work = partial(fault_of, self._directory)
-        self._paths.run(work, self._seen, lambda error: self._seen(str(error)))
+        self._look = self._run(work, self._seen, lambda error: self._seen(str(error)))
 
     def _seen(self, fault: str) -> None:
-        self._looks = False
-        self._note(f"nothing can be written to the state directory: {fault}" if fault else "")
+        text = f"nothing can be written to the {self._part}: {fault}" if fault else ""
+        self._note(self._part, text)

@@ -37,12 +37,12 @@ class Call(Generic[T]):
     """A call that is queued or has been executed.
 
     Attributes:
-        asked: monotonic time.
+        asked: awake time.
         is_over: it has been executed; `result` returns or raises its outcome.
     """
 
     def __init__(self, work: Callable[[], T]) -> None:
-        self.asked = clocks.boot_time()
+        self.asked = clocks.awake_time()
         self.is_over = False
         self._work = work
         self._outcome: Any = None
@@ -155,7 +155,7 @@ class FileThread:
     def waits(self) -> float:
         """Return the seconds since which the directory owes an answer; 0.0: it owes none."""
         with contextlib.suppress(IndexError):  # the thread ends the last call just now
-            return clocks.boot_time() - self._unfinished[0].asked
+            return clocks.awake_time() - self._unfinished[0].asked
         return 0.0
 
     @property

@@ -13,11 +13,8 @@ from rosrm.core.slave import events
 from rosrm.core.slave.commands import ListComponents, LoadComponent
 from rosrm.model.values import Component, InstanceId
 from rosrm.ros.slave.instance_clients import InstanceClients
+from rosrm.runtime.path_calls import RunPath
 
-#: Calls a function in a thread, then one of two in the loop: with its result, or its exception.
-Run = Callable[
-    [Callable[[], Component], Callable[[Component], None], Callable[[Exception], None]], None
-]
 #: Seconds after which a request for a list counts as lost; the core repeats it.
 _PATIENCE: Final = 1.0
 _MISSING: Final = (
@@ -38,7 +35,7 @@ class ComponentLoads:
 
     def __init__(
         self, clients: InstanceClients, take: Callable[[events.Event], None],
-        filled: Callable[[InstanceId, Component], Callable[[], Component]], run: Run,
+        filled: Callable[[InstanceId, Component], Callable[[], Component]], run: RunPath,
     ) -> None:  # fmt: skip
         self._clients = clients
         self._take = take

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosrm.model.values import LARGEST_NUMBER
+from rosrm.runtime.path_calls import NewestWrite, RunPath, at, run_at_once
 from rosrm.runtime.private_files import open_private
 
 #: Bytes read of the file, at most.
@@ -40,11 +41,13 @@ class JournalWatermark:
 
     Args:
         path: of the file; None: only in memory.
+        run: as `PathCalls.run`.
     """
 
-    def __init__(self, path: Path | None = None) -> None:
+    def __init__(self, path: Path | None = None, run: RunPath = run_at_once) -> None:
         self._path = path
         self._file = -1
+        self._writes = NewestWrite(run, self._keep)
         self._newest = _read(path) if path is not None else _NOTHING
 
     def note(self, newest: Watermark) -> None:
@@ -54,17 +57,15 @@ class JournalWatermark:
             return  # a forged beat
         if newest.incarnation == known.incarnation and newest.sequence <= known.sequence:
             return
-        self._newest = newest
+        self._newest = newest  # after a failed write, the next watermark is written again
+        self._writes.put(newest)
+
+    def _keep(self, newest: Watermark) -> None:
         if self._path is None:
             return
-        try:
-            self._keep(self._path, newest)
-        except OSError:
-            return  # stored in memory; the next watermark is written to the file again
-
-    def _keep(self, path: Path, newest: Watermark) -> None:
+        at(self._path)
         if self._file < 0:
-            self._file = open_private(str(path), os.O_WRONLY | os.O_CREAT)
+            self._file = open_private(str(self._path), os.O_WRONLY | os.O_CREAT)
         line = f"{newest.sequence:020d} {newest.incarnation:020d} {newest.master}\n".encode()
         os.pwrite(self._file, line, 0)
         os.ftruncate(self._file, len(line))

@@ -83,7 +83,7 @@ class Duties:
         drop_snapshots: deletes the snapshots of a process, of instances up to this one.
         execute: runs an executor, and calls its last argument with the outcome. If that takes
             longer than the order allows, the executor's strategy counts as failing.
-        read_log: returns a part of a log; raises `Refused`.
+        read_log: reads a part of a log, and calls its last argument with it, or why there is none.
         measure_links: measures links, and calls its last argument with the report.
         reload: reads the settings file, and calls its argument with a summary and the fault, of
             which one is "".
@@ -95,7 +95,7 @@ class Duties:
     keep: Callable[[InstanceId, Sequence[str], float], None]
     drop_snapshots: Callable[[InstanceId], None]
     execute: Callable[[RunExecutor, Callable[[ExecutorOutcome], None]], None]
-    read_log: Callable[[LogQuery], LogPart]
+    read_log: Callable[[LogQuery, Callable[[LogPart | Refused], None]], None]
     measure_links: Callable[[MeasureLinks, Callable[[LinkReport], None]], None]
     reload: Callable[[Callable[[str, str], None]], None]
 
@@ -197,27 +197,32 @@ class SlaveServices:
         if fault:
             open_request.answer(srv.ReadLog.Response(answer=refused("version", fault)))
             return
+
+        def done(part: LogPart | Refused) -> None:
+            open_request.answer(_log_response(part))
+
         try:
             ticket = open_request.ticket_for(request.process)
-            part = self._duties.read_log(
-                LogQuery(
-                    request.process, request.number, request.offset, request.tail, request.since,
-                    request.max_bytes, ticket.first,
-                )
-            )  # fmt: skip
         except Refused as refusal:
-            answer = refused(refusal.code, str(refusal))
-            open_request.answer(srv.ReadLog.Response(answer=answer))
+            done(refusal)
             return
-        open_request.answer(
-            srv.ReadLog.Response(
-                answer=accepted(), number=part.number, numbers=list(part.numbers),
-                content=part.content, offset=part.offset, next_offset=part.next_offset,
-                ended=part.ended, mark_times=[mark[0] for mark in part.marks],
-                mark_offsets=[mark[1] for mark in part.marks],
-                mark_pids=[mark[2] for mark in part.marks],
-            )
+        query = LogQuery(
+            request.process, request.number, request.offset, request.tail, request.since,
+            request.max_bytes, ticket.first,
         )  # fmt: skip
+        self._duties.read_log(query, done)
+
+
+def _log_response(part: LogPart | Refused) -> srv.ReadLog.Response:
+    if isinstance(part, Refused):
+        return srv.ReadLog.Response(answer=refused(part.code, str(part)))
+    return srv.ReadLog.Response(
+        answer=accepted(), number=part.number, numbers=list(part.numbers),
+        content=part.content, offset=part.offset, next_offset=part.next_offset,
+        ended=part.ended, mark_times=[mark[0] for mark in part.marks],
+        mark_offsets=[mark[1] for mark in part.marks],
+        mark_pids=[mark[2] for mark in part.marks],
+    )  # fmt: skip
 
 
 def _settled(respond: Callable[[Any], None]) -> Callable[[str, str], None]:

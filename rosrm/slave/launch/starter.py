@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import sys
@@ -223,8 +222,8 @@ class Starter:
         """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
         self._keyless.discard(instance)
-        with contextlib.suppress(OSError):
-            key_path(self.supervisor.state, instance).unlink(missing_ok=True)
+        key = key_path(self.supervisor.state, instance)
+        self.paths.run(partial(_remove, key), _ignore, _ignore)  # else it goes with the log
         self.replication.ended(instance)
 
     def _fetched(self, assignment: Assignment, fault: str) -> None:
@@ -408,3 +407,12 @@ def _lane_of(assignment: Assignment) -> str:
     spec = assignment.spec
     restored = "restored" if assignment.restored else ""
     return spec.container.engine or spec.migration.strategy or restored
+
+
+def _remove(path: Path) -> None:
+    at(path)
+    path.unlink(missing_ok=True)
+
+
+def _ignore(_outcome: object) -> None:
+    """Ignore an outcome."""

@@ -65,10 +65,6 @@ class StateKeys:
         record = self._record_of(process)
         return b"" if record is None else record[1]
 
-    def may_have(self, process: str) -> bool:
-        """Return True if a process may have a key or snapshots here."""
-        return process in self._unsaved or self._directory_of(process).exists()
-
     def drop(self, process: str, up_to: int) -> None:
         """Delete the key of instances up to a number, unless the node has snapshots here."""
         directory = self._directory_of(process)

@@ -124,6 +124,8 @@ class ReplicationService:
         self._reported: tuple[SnapshotReport, ...] | None = None
         self._reported_at = 0.0
         self._next_scan = 0.0
+        self._is_scanning = False
+        self._is_used = self._store.is_used()
         self._budget = float(settings.max_rate)
         self._budget_at = clocks.boot_time()
         threads.start(self._work, "snapshots", again=True)
@@ -185,8 +187,8 @@ class ReplicationService:
 
     def ended(self, instance: InstanceId) -> None:
         """Forget the key of an instance that has ended without a snapshot."""
-        # Most instances have none, and need no job of the thread.
-        if instance in self._searching or self._store.keys.may_have(instance.process):
+        # Most hosts have no snapshots, and need no job of the thread.
+        if self._is_used:
             drop = partial(self._store.keys.drop, instance.process, instance.number)
             self._in_thread(drop, lambda _: None)
 
@@ -205,10 +207,9 @@ class ReplicationService:
         rate = float(self._settings.max_rate)
         self._budget = min(rate, self._budget + rate * (now - self._budget_at))
         self._budget_at = now
-        if now >= self._next_scan:
-            self._next_scan = now + _SCAN_EVERY
-            if self._snapshots or self._store.is_used():
-                self._in_thread(partial(self._scan, now), self._scanned)
+        if now >= self._next_scan and not self._is_scanning:  # the disk may not answer
+            self._next_scan, self._is_scanning = now + _SCAN_EVERY, True
+            self._in_thread(partial(self._scan, now), self._scanned)
         for shipment in list(self._shipments.values()):
             self._begin_due(shipment, now)
         for transfer in list(self._transfers.values()):
@@ -222,10 +223,14 @@ class ReplicationService:
         return self._snapshots
 
     def _scan(self, now: float) -> tuple[SnapshotReport, ...]:
+        if not self._is_used and not self._store.is_used():
+            return ()
+        self._is_used = True
         self._store.end_interrupted(now)
         return self._store.scan()
 
     def _scanned(self, states: tuple[SnapshotReport, ...] | None) -> None:
+        self._is_scanning = False
         if states is not None:
             self._snapshots = states
             self._report(clocks.boot_time())
@@ -355,6 +360,7 @@ class ReplicationService:
         if not assignment.has_snapshots:
             return True
         self._preparing[assignment.instance] = None
+        self._is_used = True
         self._searching.add(assignment.instance)
         unkeyed = replace(assignment, state_key=b"")  # the key stays in the store
         self._in_thread(
