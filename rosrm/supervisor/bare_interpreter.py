@@ -11,11 +11,6 @@ from __future__ import annotations
 import os
 import sys
 
-#: Seconds after which a thread would ask the loop for the lock of the interpreter. None ever asks:
-#: `spawn_into` forks without the C library, so in the child the answer to that would wait for ever.
-#: The loop gives up the lock in each wait for events.
-_NEVER = 1000.0
-
 
 def main() -> None:
     """Listen in the state directory, report readiness, and serve until the shutdown."""
@@ -24,12 +19,12 @@ def main() -> None:
 
     # ruff: noqa: PLC0415 - these can be imported only now
     from rosrm.runtime import oom_score, timer_slack
-    from rosrm.supervisor import descriptors, endpoint, own_log
+    from rosrm.supervisor import descriptors, endpoint, file_thread, own_log
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 
     state, *limits = sys.argv[1:]
-    sys.setswitchinterval(_NEVER)
+    file_thread.let_threads_wait()
     timer_slack.use_usual_timers()  # for the processes of users
     oom_score.protect()  # the slave, which cannot do it either then, logs why
     try:

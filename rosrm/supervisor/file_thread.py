@@ -15,6 +15,7 @@ from __future__ import annotations
 import _thread
 import contextlib
 import errno
+import sys
 from _queue import SimpleQueue
 from collections import deque
 from collections.abc import Callable
@@ -25,8 +26,19 @@ from rosrm.supervisor import own_log
 
 #: Most seconds that the loop waits for a call.
 LATE: Final = 1.0
+#: Seconds after which a thread asks the loop for the lock of the interpreter.
+_NEVER: Final = 1000.0
 
 T = TypeVar("T")
+
+
+def let_threads_wait() -> None:
+    """Have no thread ask for the lock of the interpreter, for a process that calls `fork_into`.
+
+    In a child that `fork_into` makes, the answer to that would wait for the thread for ever. The
+    loop gives up the lock in each wait for events.
+    """
+    sys.setswitchinterval(_NEVER)
 
 
 class NoAnswer(OSError):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import pytest
 
 from rosrm.core.supervisor.events import ContactReported
@@ -27,7 +29,7 @@ def test_a_contact_of_another_boot_does_not_count(tmp_path, monkeypatch):
     lease_file.LastContact(str(tmp_path), DISK).keep(ContactReported(5.0))
     DISK.ask(lambda: None)
     monkeypatch.setattr(lease_file.procfs, "boot_id", lambda: "another")
-    assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
+    assert lease_file.read(str(tmp_path)) == ContactReported(-inf, -inf)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"torn", b"\xff\xff \xff", b"boot not-a-number\n"])
@@ -35,7 +37,7 @@ def test_an_unreadable_lease_file_does_not_count(tmp_path, content):
     """Each instance's own start counts then, which fences it earlier."""
     if content is not None:
         (tmp_path / "heard").write_bytes(content)
-    assert lease_file.read(str(tmp_path)) == ContactReported(0.0)
+    assert lease_file.read(str(tmp_path)) == ContactReported(-inf, -inf)
 
 
 def test_a_lease_file_that_cannot_be_written_is_logged_once(tmp_path, capfd):
