@@ -15,7 +15,7 @@ from rosrm.archive.writer import ArchiveWriter
 from rosrm.cli.output.plain import echo
 from rosrm.client import connecting
 from rosrm.client.log_collection import LogCollector
-from rosrm.errors import ConfigError, NoMaster
+from rosrm.errors import ConfigError, NoMaster, Refused
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.dispositions import handled
 from rosrm.runtime.private_files import make_private_directory
@@ -106,6 +106,10 @@ class Collecting:
             self._collector.look(self._master)
         except NoMaster as error:
             self._note(str(error))
+        except Refused as refusal:
+            if self._master is None:  # at the start: for example of another version
+                raise
+            self._note(str(refusal))
         except OSError as error:
             reason = error.strerror or str(error)
             self._note(
