@@ -12,6 +12,7 @@ from rosrm import clocks
 from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands
 from rosrm.core.slave.state import SlaveState
+from rosrm.errors import describe_fault
 from rosrm.model.durations import LONGEST_STOP
 from rosrm.model.values import InstanceState, InstanceStatus, StopPolicy
 from rosrm.ros.slave.endpoint import SlaveEndpoint
@@ -155,7 +156,11 @@ class Shutdown:
         def informed() -> None:
             self._is_informed = True
 
-        self.endpoint.leave(informed, running)
+        try:
+            self.endpoint.leave(informed, running)
+        except Exception as fault:  # noqa: BLE001 - the processes are to be stopped all the same
+            _log.warning("the master was not informed of the end: %s", describe_fault(fault))
+            return
         deadline = clocks.boot_time() + _LEAVE_PATIENCE
         self.serve(lambda: not self._is_informed and clocks.boot_time() < deadline)
 

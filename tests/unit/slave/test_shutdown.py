@@ -154,3 +154,22 @@ def test_a_stop_ends_by_a_kill_whatever_the_graces_are(slave, caplog) -> None:
     assert slave.now - began < 2 * LONGEST_STOP
     assert commands.Fence(instance) in slave.carried_out
     assert "killing (SIGKILL)" in caplog.text
+
+
+def test_a_master_that_cannot_be_informed_keeps_no_process_running(slave, monkeypatch) -> None:
+    """ROS may be gone, or no file can be opened; the processes are stopped all the same."""
+    stopped = []
+
+    def fail(*_):
+        raise RuntimeError("failed to send request")
+
+    def stop():
+        stopped.append(True)
+        slave.ending.note_supervisor_left("")
+
+    slave.report("a", InstanceState.RUNNING)
+    monkeypatch.setattr(slave.endpoint, "leave", fail)
+    slave.when_stopped = stop
+    slave.end()
+    assert stopped == [True]
+    assert "the master was not informed of the end: RuntimeError" in slave.log.text
