@@ -130,6 +130,9 @@ class Shutdown:
         if self._supervisor_fault:
             _log.error("%s", self._supervisor_fault)
             return self._fail_without_supervisor()
+        if _live(self._begun()):  # the supervisor waits for none that SIGKILL does not end
+            self._supervisor_fault = "SIGKILL has not ended what the supervisor left"
+            return self._fail_without_supervisor()
         self.endpoint.wait_until_received()
         part = "supervisor" if cause == STOP_ALL else "slave"
         count = counted(live, "process was stopped", "processes were stopped")

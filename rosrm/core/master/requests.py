@@ -351,9 +351,9 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
         check_gangs(state, [one.spec for one in own], owner, may_join=True)
         check_number(state, len(own), owner, is_operator=own[0].by_operator)
     check_quota(state, (one.spec for one in ended if one.principal == event.by.name), event.by)
-    for process in processes:
-        _restart(state, process, now, event.by)
-    state.emit(Reply(event.request, message=f"{count(len(processes))} restarted"))
+    outcomes = Counter(_restart(state, process, now, event.by) for process in processes)
+    message = "; ".join(f"{count(number)} {outcome}" for outcome, number in outcomes.items())
+    state.emit(Reply(event.request, message=message))
 
 
 def _restart_fault(state: MasterState, process: Process) -> str:
@@ -386,11 +386,13 @@ def _why_not_desired(state: MasterState, process: Process) -> str:
     return f"{process.name} is not in {version}: apply a version that has it"
 
 
-def _restart(state: MasterState, process: Process, now: float, by: Requester) -> None:
+def _restart(state: MasterState, process: Process, now: float, by: Requester) -> str:
+    """Begin the restart of a process; return what happens to it."""
     state.record(
         now, EventKind.RESTART_REQUESTED, f"a restart of {process.name} was requested",
         process=process.name, by=by,
     )  # fmt: skip
+    outcome = "queued again"
     if process.is_at_rest or process.image is not None:
         queue_again(state, process, now)
     elif process.phase in WAITING:
@@ -398,10 +400,14 @@ def _restart(state: MasterState, process: Process, now: float, by: Requester) ->
         allow_every_host(process)
         state.enqueue(process, now)
     elif (owner := state.instances[process.owner]).state not in (None, InstanceState.HELD):
+        restarts.begin(state, process, owner, now)
+        outcome = "being restarted"
+    else:
         # An instance that has not started yet starts without this order. An order to restart that
         # arrives before the assignment would prevent the start for good.
-        restarts.begin(state, process, owner, now)
+        outcome = "not started yet"
     state.save(process)
+    return outcome
 
 
 # --- migrate, cordon, drain -------------------------------------------------------------------

@@ -412,6 +412,17 @@ def test_a_degraded_application_is_not_recorded_as_applied() -> None:
     assert cluster.recorded("application_failed")[-1] == said
 
 
+def test_the_answer_to_an_apply_that_changes_nothing_says_what_is_not_as_desired() -> None:
+    """The version is in force, and its process is out of reach."""
+    cluster = Cluster("a", suspect=1.0, lease=3.0)
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    assert cluster.apply("nav", process("p")).message == "nav is at version 1: nothing changes"
+    cluster.cut("a", seconds=6.0)
+    said = "nav is at version 1: nothing changes, but p is unreachable: a is lost"
+    assert cluster.apply("nav", process("p")).message == said
+
+
 def test_a_finished_service_is_not_as_desired() -> None:
     """The application is degraded, and the next apply starts the service again; a job is done."""
     cluster = Cluster("a")

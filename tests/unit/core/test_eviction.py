@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import listing
-from rosrm.model.values import ResourceDescription
+from rosrm.model.values import HostLossAction, HostLossPolicy, ResourceDescription
 from tests.unit.core.cluster import GIB, MIB, Cluster, Machine, movable, process
 
 
@@ -257,7 +257,21 @@ def test_the_answer_to_a_drain_says_what_cannot_leave_yet() -> None:
     cluster.set_host("b", "uncordon")
     unreachable = "each of p and q is unreachable; only a running process can be moved"
     said = cluster.set_host("a", "drain").message
-    assert said == f"a is draining: 2 processes cannot leave yet: {unreachable}"
+    unknown = "what else runs there is not known: it is lost"
+    assert said == f"a is draining: 2 processes cannot leave yet: {unreachable}; {unknown}"
+
+
+@pytest.mark.parametrize("then", ["elsewhere", "stop"])
+def test_the_answer_to_a_drain_of_a_lost_host_claims_nothing(then: HostLossAction) -> None:
+    """Its processes may still run there, also those that run elsewhere by now."""
+    cluster = Cluster("a", "b", suspect=1.0, lease=3.0)
+    cluster.submit(process("p", host_loss=HostLossPolicy(then)))
+    (host,) = cluster.where("p")
+    cluster.cut(host, seconds=10.0)
+    said = cluster.set_host(host, "drain").message
+    assert said == f"{host} is draining: what runs there is not known: it is lost"
+    cluster.wait(3.0)
+    assert not cluster.recorded("host_drained")
 
 
 def test_a_process_that_no_other_host_may_take_stays_on_a_draining_host() -> None:

@@ -250,11 +250,21 @@ def test_cancel_during_a_move_ends_both_instances(overlap: bool) -> None:
 # --- restart ----------------------------------------------------------------------------------
 
 
+def test_the_answer_to_a_restart_says_what_happens_to_each_process() -> None:
+    """None of them is restarted yet, and one that has not started starts once."""
+    cluster = Cluster("a").with_processes(process("p"), process("q"), process("r"))
+    cluster.cancel("q", "r")
+    cluster.machines["a"].connected = False
+    cluster.submit(process("s"))
+    said = "1 process being restarted; 2 processes queued again; 1 process not started yet"
+    assert cluster.restart("p", "q", "r", "s").message == said
+
+
 def test_restart_of_a_running_process_happens_on_its_host() -> None:
     """The instance and the host stay the same, and the process becomes ready again."""
     cluster = Cluster("a").with_processes(process("p"))
     before = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
-    assert cluster.restart("p").message == "1 process restarted"
+    assert cluster.restart("p").message == "1 process being restarted"
     after = cluster.machines["a"].programs[cluster.machines["a"].find("p")].pid
     assert after > before
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 1)

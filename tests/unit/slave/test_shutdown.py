@@ -54,6 +54,12 @@ class Slave:
         spec = ProcessSpec(name, command=("sleep",), stop=STOP)
         self.state.hold(instance, HeldInstance(InstanceStatus(instance, state), spec))
 
+    def end_supervisor(self) -> None:
+        """End all processes and then the supervisor."""
+        for name in "pq":
+            self.report(name, InstanceState.EXITED)
+        self.ending.note_supervisor_left("")
+
     def end(self) -> int:
         return self.ending.carry_out("SIGINT")
 
@@ -121,7 +127,7 @@ def test_a_second_signal_is_answered_with_what_is_left_and_until_when(slave) -> 
         slave.ending.log_progress()
         slave.now += 1.0
         slave.ending.log_progress()
-        slave.ending.note_supervisor_left("")
+        slave.end_supervisor()
 
     slave.when_stopped = stop
     slave.ending.log_progress()
@@ -137,9 +143,23 @@ def test_a_second_signal_is_answered_with_what_is_left_and_until_when(slave) -> 
 def test_a_time_that_is_not_known_is_not_claimed(slave) -> None:
     """This run of the slave does not know the `stop` of a re-adopted process."""
     slave.state.held[InstanceId("q", 1)].spec = None
-    slave.when_stopped = lambda: slave.ending.note_supervisor_left("")
+    slave.when_stopped = slave.end_supervisor
     assert slave.end() == 0
     assert slave.said[0] == "stopping 2 processes (SIGINT)"
+
+
+def test_a_process_that_the_supervisor_could_not_kill_was_not_stopped(slave, caplog) -> None:
+    """A shutdown of the supervisor does not wait for a process that is stuck in the kernel."""
+
+    def stop() -> None:
+        slave.report("p", InstanceState.EXITED)
+        slave.report("q", InstanceState.STOPPING)
+        slave.ending.note_supervisor_left("")
+
+    slave.when_stopped = stop
+    assert slave.end() == 1
+    assert "q#1 may still run: SIGKILL has not ended" in caplog.text
+    assert len(slave.said) == 1
 
 
 def test_a_stop_ends_by_a_kill_whatever_the_graces_are(slave, caplog) -> None:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from rosrm.core.master import events as happened
 from rosrm.core.master.applications import rollout
 from rosrm.core.master.applications.difference import Difference, differences
+from rosrm.core.master.applications.listing import described, unwell_processes
 from rosrm.core.master.applications.planning import Outlook, plan
 from rosrm.core.master.assignment.gangs import check_gangs
 from rosrm.core.master.cancellation import cancel
@@ -76,7 +77,7 @@ def execute(
     for one in prepared:
         owner = one.application
         make_room(state, owner.principal, is_operator=owner.by_operator)
-    return _summary(prepared), tuple(_actions(prepared))
+    return _summary(state, prepared), tuple(_actions(prepared))
 
 
 def outlook(state: MasterState, targets: Sequence[Target], by: Requester, now: float) -> Outlook:
@@ -84,7 +85,7 @@ def outlook(state: MasterState, targets: Sequence[Target], by: Requester, now: f
     prepared = _prepared(state, targets, by)
     names = {one.application.name for one in prepared}
     planned = plan(state, lambda copy: _want_all(copy, prepared, by, now), names, now)
-    return replace(planned, message="; ".join((_summary(prepared), *planned.returns)))
+    return replace(planned, message="; ".join((_summary(state, prepared), *planned.returns)))
 
 
 def _want_all(state: MasterState, prepared: Sequence[Prepared], by: Requester, now: float) -> None:
@@ -320,16 +321,17 @@ def _actions(prepared: Iterable[Prepared]) -> Iterable[PlannedAction]:
             )  # fmt: skip
 
 
-def _summary(prepared: Sequence[Prepared]) -> str:
-    return "; ".join(map(_summary_of, prepared))
+def _summary(state: MasterState, prepared: Sequence[Prepared]) -> str:
+    return "; ".join(_summary_of(state, one) for one in prepared)
 
 
-def _summary_of(one: Prepared) -> str:
+def _summary_of(state: MasterState, one: Prepared) -> str:
     """Return a phrase on the version and the number of each kind of action."""
     name, version = one.application.name, one.version
     if not one.found:
         what = "is cancelled already" if version is None else f"is at version {version.number}"
-        return f"{name} {what}: nothing changes"
+        unwell = unwell_processes(state, one.application)
+        return f"{name} {what}: nothing changes{f', but {described(unwell)}' if unwell else ''}"
     numbers = Counter(found.action for found in one.found.values())
     parts = [f"{count(number)} to {action.value}" for action, number in numbers.items()]
     title = f"{name}{f' version {version.number}' if version else ''}"

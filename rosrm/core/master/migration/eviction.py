@@ -380,7 +380,8 @@ def _why_nowhere(state: MasterState, process: Process, ranking: Ranking, source:
 def departures(state: MasterState, host: Host, now: float) -> str:
     """Return phrases on the processes that leave a draining host, that wait for it, and cannot."""
     names, staying = _leaving(state, host, now), _staying(state, host, now)
-    if not names:
+    unreachable = state.hosts.why_unreachable(host)
+    if not names and not unreachable:
         return f"nothing can leave: {'; '.join(few(staying))}" if staying else "no process is left"
     waits = {name: why for name in names if (why := _why_not_yet(state, name, now))}
     leaving = [name for name in names if name not in waits]
@@ -393,6 +394,8 @@ def departures(state: MasterState, host: Host, now: float) -> str:
         phrases.append(f"{count}: {'; '.join(few(_grouped(waits.items())))}")
     if staying:
         phrases.append(f"cannot leave: {'; '.join(few(staying))}")
+    if unreachable:
+        phrases.append(f"what {'else ' * bool(phrases)}runs there is not known: it {unreachable}")
     return "; ".join(phrases)
 
 
