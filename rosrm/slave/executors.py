@@ -58,6 +58,7 @@ class Executors:
         self._clock = clock
         self._failed_at: dict[str, float] = {}
         self._late: Counter[str] = Counter()
+        self._open: dict[tuple[str, str], list[Done]] = {}
         self.failing = dict(broken)
 
     @property
@@ -74,6 +75,9 @@ class Executors:
         done: Done,
     ) -> None:  # fmt: skip
         """Run an executor in a thread of its own.
+
+        A call with the same arguments that has not returned answers the order, too: a restarted
+        master repeats the order of its step, and two calls at once would disturb each other.
 
         Args:
             arguments: a JSON object.
@@ -94,8 +98,25 @@ class Executors:
                 f"executor {name} on {here['host']}: {MOST_LATE} earlier calls of it have not "
                 "returned; restart the slave after the cause has been corrected"
             )
-        strategy, function = offered.strategy, offered.call
-        place = definition(function)
+        call = name, json.dumps(dict(arguments), sort_keys=True, default=dict)
+        if call in self._open:
+            self._open[call].append(done)
+            return
+        self._open[call] = [done]
+        complete = {**arguments, "here": {**here, "options": dict(offered.options)}}
+        try:
+            self._begin(offered, call, complete, timeout)
+        except RuntimeError as fault:  # no further thread
+            del self._open[call]
+            raise Refused(f"executor {name} on {here['host']}: {fault}") from None
+
+    def _begin(
+        self, offered: OfferedExecutor, call: tuple[str, str], arguments: Mapping[str, Any],
+        timeout: float,
+    ) -> None:  # fmt: skip
+        """Start the thread of a call; raises RuntimeError."""
+        strategy, function, (name, _) = offered.strategy, offered.call, call
+        place, waiting = definition(function), self._open[call]
         is_late: bool | None = False  # None: it has returned
 
         def note_late() -> None:
@@ -103,27 +124,30 @@ class Executors:
             if is_late is not None:
                 is_late = True
                 self._late[name] += 1
+                del self._open[call]
                 self._fail(
                     strategy, f"executor {name} did not return within {timeout:g} s ({place})"
                 )
 
         timer = threading.Timer(min(timeout, threading.TIMEOUT_MAX), self._post, [note_late])
         timer.daemon = True
-        complete = {**arguments, "here": {**here, "options": dict(offered.options)}}
 
         def settle(outcome: ExecutorOutcome) -> None:
             nonlocal is_late
             self._late[name] -= bool(is_late)
+            if not is_late:
+                del self._open[call]
             is_late = None
             if outcome.code in ("", "unable"):
                 self._work(strategy)
             else:
                 where = f" ({place})" if outcome.code == "bad_result" else ""
                 self._fail(strategy, f"executor {outcome.message}{where}")
-            done(outcome)
+            for one in waiting:
+                one(outcome)
 
         def work() -> None:
-            outcome = _outcome(titled("migration", strategy), name, function, complete)
+            outcome = _outcome(titled("migration", strategy), name, function, arguments)
             timer.cancel()
             self._post(partial(settle, outcome))
 
@@ -136,9 +160,9 @@ class Executors:
             if timeout > 0.0:
                 timer.start()
             threads.start(work, f"executor {name}", failed=fail)
-        except RuntimeError as fault:  # no further thread
+        except RuntimeError:
             timer.cancel()
-            raise Refused(f"executor {name} on {here['host']}: {fault}") from None
+            raise
 
     def _fail(self, strategy: str, error: str) -> None:
         self._failed_at[strategy] = self._clock()

@@ -345,6 +345,11 @@ def _supervisor_replaced(
         _follow(state, status, now, event.memos.get(status.instance))
     for instance in event.fenced & state.held.keys():
         state.held[instance].fenced = True
+    again += [
+        commands.Remember(instance, held.memo)
+        for instance, held in state.alive.items()
+        if instance in known and held.memo != event.memos.get(instance, Memo())
+    ]
     return [
         *fencing.renew(state, now), *again, *_start_waiting(state, now),
         commands.Report(state.statuses(), complete=True),

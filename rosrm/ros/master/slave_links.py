@@ -254,11 +254,11 @@ class HostLinks:
         self, link: HostLink, send: Callable[[], None], deadline: float = math.inf,
         done: Callable[[None], None] = lambda _: None,
     ) -> None:  # fmt: skip
-        """Call `send` now, or when the first beat of the slave has come.
+        """Call `send` now, or when the first beat of the slave has come, after what waits already.
 
         If the deadline (monotonic seconds) passes first, `done` is called with None instead.
         """
-        if self.reading_stats.beat[link.host_id]:
+        if self.reading_stats.beat[link.host_id] and not link.deferred:
             send()
         else:
             self._wait(link, _Deferred(deadline, send, done))
@@ -384,7 +384,7 @@ class HostLinks:
             self._handle(_order_answered(command.order_id, response))
 
         def send() -> None:
-            if not self._is_discovered(link):
+            if link.deferred or not self._is_discovered(link):  # in the order of the decisions
                 self._wait(link, _Deferred(deadline, send, done))
                 return
             self._send(link, request, deadline, done)

@@ -322,6 +322,16 @@ def test_an_instance_of_a_former_run_of_the_slave_is_ready(one) -> None:
 # --- a later run of the slave -----------------------------------------------------------------
 
 
+def test_facts_that_a_killed_supervisor_has_not_stored_are_stored_again(node) -> None:
+    """A later run of the slave would wait for the node again."""
+    (remember,) = [
+        one for one in node.step(SeenInGraph(NODE_1)) if isinstance(one, slave_commands.Remember)
+    ]
+    runs = InstanceStatus(NODE_1, STATE.RUNNING, pid=5)
+    assert remember in node.step(replaced(runs))
+    assert remember not in node.step(replaced(runs, memos={NODE_1: remember.memo}))
+
+
 def re_adopted(one: Slave, memo: Memo | None, pid: int = 5) -> Slave:
     """Return a later run of the slave that re-adopts the node from the supervisor."""
     later = Slave(one.now)

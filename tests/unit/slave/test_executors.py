@@ -55,6 +55,30 @@ def test_an_answer_that_is_no_object_is_a_failure_of_its_own(answer, said) -> No
     assert message == f"wait answered {said}; a JSON object is required"
 
 
+def test_a_repeated_order_does_not_run_an_executor_beside_itself() -> None:
+    """A restarted master repeats the order of its step: one call answers both orders."""
+    goes_on, calls, outcomes = threading.Event(), [], []
+
+    def dump(given):
+        calls.append(given["of"])
+        assert goes_on.wait(PATIENCE)
+        return {"made": given["of"]}
+
+    rig = Rig(dump)
+    for number in (1, 1, 2):
+        rig.executors.execute("wait", {"of": number}, 60.0, here=HERE, done=outcomes.append)
+    goes_on.set()
+    for _ in range(2):
+        rig.posted.get(timeout=PATIENCE)()
+    assert sorted(calls) == [1, 2]
+    assert sorted(one.result for one in outcomes) == [
+        '{"made": 1}', '{"made": 1}', '{"made": 2}',
+    ]  # fmt: skip
+    rig.executors.execute("wait", {"of": 1}, 60.0, here=HERE, done=outcomes.append)
+    rig.posted.get(timeout=PATIENCE)()
+    assert sorted(calls) == [1, 1, 2]
+
+
 def test_an_executor_gets_its_host_with_the_options_of_its_strategy() -> None:
     rig, seen = Rig(lambda _: {}), []
     offered = OfferedExecutor("acme", lambda given: seen.append(given) or {}, {"as_root": True})

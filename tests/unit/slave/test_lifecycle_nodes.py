@@ -265,7 +265,9 @@ def test_a_repeated_report_of_the_run_changes_nothing() -> None:
     """A new supervisor reports all runs; the transition under way continues."""
     slave = seen()
     read(slave, "unconfigured")
-    commands = slave.step(SupervisorReplaced((slave.of("n").status,)))
+    held = slave.of("n")
+    memos = {held.status.instance: held.memo}
+    commands = slave.step(SupervisorReplaced((held.status,), memos))
     assert not [one for one in commands if not isinstance(one, Report)]
     assert transitions(answered(slave, "configure")) == ["activate"]
 

@@ -13,7 +13,7 @@ from rosrm.core.master.commands import Assign, SendOrder
 from rosrm.core.master.events import BAD_RESULT
 from rosrm.keys.cluster import ClusterSecret
 from rosrm.keys.security import MasterSecurity
-from rosrm.model.orders import ReportInstances, StartInstance
+from rosrm.model.orders import ReloadSettings, ReportInstances, StartInstance
 from rosrm.model.values import Assignment, HostDescription, InstanceId, ProcessSpec
 from rosrm.ros.control import accepted
 from rosrm.ros.master.reading_decoder import Runs
@@ -93,6 +93,19 @@ def test_an_order_waits_until_discovery_finds_the_service_of_the_slave(links, co
     control.ready = True
     receive_reading(links, beat=300, sequence=3)
     assert links._client.beats == [300]
+
+
+def test_an_order_does_not_overtake_one_that_waits_for_discovery(links, control):
+    """The later order is the newer decision, for example another restart policy."""
+    control.ready = False
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    receive_reading(links, beat=100, sequence=1)
+    links.order(SendOrder(1, HOST, ReportInstances()), now=0.0)
+    control.ready = True
+    links.order(SendOrder(2, HOST, ReloadSettings()), now=0.0)
+    receive_reading(links, beat=200, sequence=2)
+    sent = [request.order for request in links._client.requests]
+    assert sent == [ReportInstances(), ReloadSettings()]
 
 
 def test_discovery_is_asked_once_for_each_registration(links, control):
