@@ -138,6 +138,20 @@ def test_a_fenced_instance_is_not_queued_again_because_of_its_pending_restart() 
     assert cluster.phase("p") == "failed"
 
 
+def test_a_restart_of_a_run_that_ended_without_a_master_is_not_lost() -> None:
+    """The run is older than the order, whose time is journaled."""
+    cluster = Cluster("a").with_processes(process("p"))
+    machine = cluster.machines["a"]
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    machine.ordered.clear()
+    cluster.now += 1.0
+    cluster.kill_master()
+    machine.finish("p", cluster.now, run_time=10.0)
+    cluster.restart_master()
+    cluster.wait(1.0)
+    assert cluster.phase("p") == "running"
+
+
 @pytest.mark.parametrize("run_time", [1.0, 3600.0])
 def test_a_job_whose_restart_was_not_reported_finishes_once(run_time: float) -> None:
     """The statuses of the restart are lost: only a run longer than the time since is older."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import inf
 from typing import Any
 
 from rosrm.core.master.checkpoint import images
@@ -123,10 +124,14 @@ def _restored_moment(state: MasterState, item: Mapping[str, Any], wall: float, n
     The clock of the day may have been set since. Its time `wall` counts only if the machine has
     booted in between, or if another machine wrote the journal.
     """
-    boot, at = item.get("at", ("", 0.0))  # absent in older journals
-    if boot and boot == state.boot:
-        return min(now, float(at))
-    return now - max(0.0, state.wall - wall)
+    at = _moment_of_this_boot(state, item, now)
+    return now - max(0.0, state.wall - wall) if at is None else at
+
+
+def _moment_of_this_boot(state: MasterState, item: Mapping[str, Any], now: float) -> float | None:
+    """Return a journaled time by this master's clock; None: it is of another boot, or unknown."""
+    boot, at = item.get("at") or ("", 0.0)  # absent in older journals
+    return min(now, float(at)) if boot and boot == state.boot else None
 
 
 def _restore_place(state: MasterState, process: Process, now: float) -> None:
@@ -169,7 +174,10 @@ def _restore_instances(
     restart = item.get("restart")  # absent in older journals
     if process.owner and restart:
         known = fields_from_plain(PendingRestart, restart, processes.JOURNALED_RESTART)
-        state.instances[process.owner].restarting = PendingRestart(**known)
+        at = _moment_of_this_boot(state, restart, now)
+        state.instances[process.owner].restarting = PendingRestart(
+            **known, ordered_at=-inf if at is None else at
+        )
 
 
 def _has_run(state: MasterState, process: Process, now: float) -> bool:

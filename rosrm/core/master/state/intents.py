@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import isfinite
 from operator import attrgetter
 from typing import Any, Final, Protocol
 
@@ -96,7 +97,10 @@ def process_intent(tables: Tables, process: Process) -> Intent:
             },
             "standby": standby and _migration(tables, standby, ()),
             "left_behind": left and to_plain(left),
-            "restart": restart and fields_to_plain(restart, JOURNALED_RESTART),
+            "restart": restart and {
+                **fields_to_plain(restart, JOURNALED_RESTART),
+                "at": moment(tables.boot, restart.ordered_at),
+            },
             "image": process.image and to_plain(process.image),
             **dict(zip(JOURNALED, _journaled_of(process), strict=True)),
             "ran_before": process.ran_before_owner(owner),
@@ -121,7 +125,7 @@ def _migration(tables: Tables, migration: Migration, stopping: Sequence[int]) ->
 
 def moment(boot: str, at: float) -> list[str | float]:
     """Return a time of the master's clock, which counts from the boot of its machine, as plain."""
-    return [boot, at]
+    return [boot, at] if isfinite(at) else []
 
 
 def application_intent(application: Application) -> Intent:

@@ -77,7 +77,8 @@ class PendingRestart:
     Attributes:
         pid, restarts: the run that is to end.
         follows: a dependency was restarted; False: a client has requested the restart.
-        ordered_at: time of the first order; -inf: a former master gave it.
+        ordered_at: time of the first order; -inf: unknown, because it was given before a boot of
+            the master's machine.
     """
 
     pid: int
