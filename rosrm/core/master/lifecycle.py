@@ -298,6 +298,11 @@ def _handle_unknown_instance(
         f"{status.instance} is not assigned to {host.name}: the master {how}",
         process=status.instance.process, host=host.name,
     )  # fmt: skip
+    process = state.processes.get(status.instance.process)
+    left = None if process is None else process.left_behind
+    if process is not None and left is not None and left.number == status.instance.number:
+        state.clear_left_behind(process)  # because its stop is ordered, it is not readopted
+        state.save(process)
     spec = ProcessSpec(status.instance.process)
     unknown = adopt_to_stop(state, status.instance, spec, host, now, stray=True)
     state.note_held(unknown, status.devices)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -59,6 +59,7 @@ class Machine(Host[Program]):
         connected: True while the wires work.
         takes: False for a slave that accepts no work.
         leaves: True while its slave stops, from before the master learns it.
+        ordered_restarts: number of restarts by order of each process here, by name.
         measures: returns the JSON of the report on links; None: its slave refuses the order.
     """
 
@@ -79,6 +80,7 @@ class Machine(Host[Program]):
     leaves: bool = False
     measures: Callable[[MeasureLinks], Mapping[str, Any]] | None = None
     fresh: bool = False
+    ordered_restarts: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.resources = self.resources or (
@@ -137,6 +139,10 @@ class Machine(Host[Program]):
     def _stopped(self, instance: InstanceId, now: float) -> None:
         if instance.process not in self.stubborn:
             super()._stopped(instance, now)
+
+    def _restart(self, instance: InstanceId, now: float, *, by_policy: bool = False) -> None:
+        self.ordered_restarts[instance.process] += not by_policy
+        super()._restart(instance, now, by_policy=by_policy)
 
     def find(self, name: str) -> InstanceId:
         """Return the newest running instance of a process."""

@@ -10,6 +10,7 @@ from unittest.mock import ANY
 import pytest
 
 from rosrm.core.master import events as happened
+from rosrm.core.master.invariants import check
 from rosrm.model.orders import AmendInstance, FenceInstance, StartInstance
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase
 from rosrm.model.values import (
@@ -338,3 +339,21 @@ def test_an_ended_process_is_not_pruned_before_its_standby_is_given_up() -> None
     cluster.wait(1.0)
     assert cluster.ask(happened.PruneRequested, ("p",)).accepted
     cluster.wait(1.0)
+
+
+def test_an_instance_that_is_being_stopped_is_not_readopted_after_another_loss() -> None:
+    """It returned with its host while its standby, which was not ready, had to end."""
+    cluster = with_standby(quirk="unfit", host_loss=HostLossPolicy("elsewhere"))
+    for machine in cluster.machines.values():
+        machine.stubborn.add("p")
+    lose(cluster, "a")
+    assert cluster.phase("p") == "stopping"
+    cluster.restart_slave("a")
+    cluster.let_go("p", "b")
+    cluster.set_host("b", "cordon")
+    lose(cluster, "a")
+    cluster.reconnect("a", seconds=2.0)
+    check(cluster.state)
+    cluster.let_go("p", "a")
+    cluster.wait(3.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])

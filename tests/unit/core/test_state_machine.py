@@ -955,6 +955,15 @@ class Play(RuleBasedStateMachine):
                 self.left.discard(record.facts["number"])
         self.records_seen = len(self.cluster.records)
 
+    @invariant()
+    def each_restart_is_carried_out_at_most_once(self) -> None:
+        """Orders that are lost, late or repeated restart no other run than the one they mean."""
+        kinds = (EventKind.RESTART_REQUESTED, EventKind.DEPENDENCY_RESTARTED)
+        begun = Counter(one.process for one in self.cluster.records if one.kind in kinds)
+        for machine in self.cluster.machines.values():
+            begun.subtract(machine.ordered_restarts)
+        assert min(begun.values(), default=0) >= 0, begun
+
     def is_heard_well(self, machine: Machine) -> bool:
         """Return True if the contact was long enough to report all instances there."""
         calm = self.known(machine) and self.is_up(machine)
