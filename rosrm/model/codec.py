@@ -165,11 +165,12 @@ def fields_from_plain(
 LONGEST_OF_PLUGIN: Final = 1 << 19
 
 
-def checked(value: T, what: str) -> T:
+def checked(value: T, kind: type[T], what: str) -> T:
     """Return a plugin's value after a round trip through JSON, as the journal restores it.
 
     Args:
         value: a dataclass.
+        kind: its declared type. The plugin may derive its own, whose fields no journal can restore.
         what: name of the value in the message.
 
     Raises:
@@ -183,7 +184,7 @@ def checked(value: T, what: str) -> T:
             )
         plain = json.loads(text)
         json.dumps(plain, ensure_ascii=False).encode()  # as messages hold it
-        return from_plain(type(value), plain)
+        return from_plain(kind, plain)
     except UnicodeEncodeError:
         raise PluginError(f"an unsound {what}: it has a character that UTF-8 cannot hold") from None
     except (ValueError, TypeError) as fault:

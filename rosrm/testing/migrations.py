@@ -136,7 +136,9 @@ class MigrationContract:
                 assert not fault, f"the plan of {hook} is unsound: {fault}"
                 again = _plan(hook, partial(make, here), strategy)
                 assert again == plan, f"{hook} gave another plan for the same move"
-                assert checked(plan, "plan") == plan, f"the journal changes the plan of {hook}"
+                assert checked(plan, Plan, "plan") == plan, (
+                    f"the journal changes the plan of {hook}"
+                )
 
     def test_periodic_checkpoints_are_sound(self) -> None:
         """Each periodic checkpoint is a step on the instance's host, distinct for each time.
@@ -216,7 +218,7 @@ class MigrationContract:
         """A restarted master reads the identical plan from its journal."""
         for move in self.moves():
             plan = self._plan(self.make(), move)
-            assert checked(plan, "plan") == plan, "the journal gives back another plan"
+            assert checked(plan, Plan, "plan") == plan, "the journal gives back another plan"
 
     def test_a_shadow_is_released_after_the_commit(self) -> None:
         """A shadow gets the restart policy of its spec after the commit, and not before.
@@ -351,7 +353,7 @@ def _plan(hook: str, ask: Callable[[], Plan], strategy: object) -> Plan:
 
     def sound() -> Plan:
         plan = required(ask(), Plan)
-        checked(plan, "plan")
+        checked(plan, Plan, "plan")
         return plan
 
     return call(hook, CALL_LIMIT, sound, strategy)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -634,6 +634,29 @@ def test_a_plan_with_a_text_that_no_message_can_hold_is_unsound() -> None:
     reply = cluster.migrate("p")
     assert not reply.accepted
     assert "an unsound plan: it has a character that UTF-8 cannot hold" in reply.message
+
+
+def test_a_plan_of_a_class_of_the_plugin_is_journalled_as_a_plan() -> None:
+    """The next master could not read a field of the plugin, and would not start."""
+
+    @dataclass(frozen=True)
+    class Noted(Plan):
+        note: str = "mine"
+
+    class Named(Plan):
+        """A plan without further fields."""
+
+    def with_field(move: Move) -> Plan:
+        return Noted(StartFirstOrStopFirst().propose(move).steps)
+
+    def without_field(move: Move) -> Plan:
+        return Named(StartFirstOrStopFirst().propose(move).steps)
+
+    message = moving_by(with_field).migrate("p").message
+    assert "an unsound plan: unknown note; allowed: steps, overlap, options" in message
+    cluster = moving_by(without_field)
+    assert cluster.migrate("p").accepted
+    assert {type(one.plan) for one in cluster.state.migrations.values()} == {Plan}
 
 
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:

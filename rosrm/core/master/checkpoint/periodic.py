@@ -184,7 +184,7 @@ def _order(
 
     def ask() -> Execute:
         step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
-        return checked(step, "step")
+        return checked(step, Execute, "step")
 
     try:
         step = state.plugins.ask(

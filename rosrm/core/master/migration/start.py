@@ -236,7 +236,7 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
             plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
         except ValueError as reason:  # by its contract: the strategy cannot move this process
             return _no_plan(name, describe_fault(reason))
-        plan = checked(plan, "plan")  # the plan is written to the journal
+        plan = checked(plan, Plan, "plan")  # the plan is written to the journal
         fault = plan_fault(plan, move, aim) or _executor_fault(state, name, plan)
         if fault:
             raise PluginError(f"an unsound plan: {fault}")
