@@ -24,7 +24,7 @@ import pluggy
 
 from rosrm.errors import PluginError, plain_text
 from rosrm.extensions import guard, hookspecs
-from rosrm.extensions.answers import fault_of
+from rosrm.extensions.answers import whole
 from rosrm.extensions.contracts import (
     Capabilities,
     CheckpointOffer,
@@ -240,11 +240,7 @@ def _take(loaded: Loaded, source: PluginSource, hook: str, function: Callable[..
             return [(None, "", f" returned {given}, not a list of {wanted.__name__}")]
         if len(answer) > _MOST_OFFERS:
             return [(None, "", f" returned {len(answer)} offers; allowed: {_MOST_OFFERS}")]
-        checked = [(one, _fault_of(one, wanted)) for one in islice(answer, _MOST_OFFERS)]
-        return [
-            (one, plain_text(getattr(one, "name", ""))[:64], fault and f": {fault}")
-            for one, fault in checked
-        ]
+        return [_taken(one, wanted) for one in islice(answer, _MOST_OFFERS)]
 
     try:
         found = _in_time(source, place, offers)
@@ -270,9 +266,28 @@ def _call(hook: str, function: Callable[..., Any]) -> Any:
     return answers[0] if answers else None  # pluggy omits an answer of None
 
 
-def _fault_of(offer: object, wanted: type[Any]) -> str:
-    """Return why an offer cannot be used; "" if it can."""
-    if type(offer) is not wanted:  # a property of a subclass would run at each access
+def _taken(offer: object, wanted: type[Any]) -> tuple[Any, str, str]:
+    """Return a copy of an offer that its plugin cannot change, its name, and its fault or ""."""
+    name = plain_text(getattr(offer, "name", ""))[:64]
+    copied, declared = offer, ""
+    if type(offer) is wanted:  # a property of a subclass would run at each access
+        try:
+            copied = _copied(offer, wanted)
+        except PluginError as fault:
+            declared = str(fault)
+    fault_found = _fault_of(copied, wanted, declared)
+    return copied, name, fault_found and f": {fault_found}"
+
+
+def _fault_of(offer: object, wanted: type[Any], declared: str) -> str:
+    """Return why an offer cannot be used; "" if it can.
+
+    Args:
+        offer: a copy, unless it has a fault.
+        wanted: type of offers of the hook.
+        declared: first fault of a field against its declaration; "": none.
+    """
+    if type(offer) is not wanted:
         return f"offers {plain_text(repr(offer))}, which is not a {wanted.__name__}"
     name: object = getattr(offer, "name", None)
     if not isinstance(name, str) or not name.strip():
@@ -281,7 +296,6 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
         return f"offers the name {name!r}; allowed: {_NAME_FORM}"
     if not callable(getattr(offer, "create", None)):
         return f"{name!r}: `create` cannot be called"
-    declared = _fault_of_fields(offer, wanted)
     if isinstance(offer, LauncherOffer):  # the configuration does not choose these: no options
         if not declared:
             wrong = [one for one in offer.variables if not _VARIABLE.fullmatch(one)]
@@ -304,18 +318,17 @@ def _fault_of(offer: object, wanted: type[Any]) -> str:
     return f"{name!r}: {fault}" if fault else ""
 
 
-def _fault_of_fields(offer: object, wanted: type[Any]) -> str:
-    """Return the first field of an offer that has another type or range than declared; ""."""
+def _copied(offer: Any, wanted: type[Any]) -> Any:
+    """Return a copy of an offer; raise `PluginError` for a field of another type or range."""
     hints = get_type_hints(wanted)
+    values = {}
     for field in fields(wanted):
-        value: Any = getattr(offer, field.name)
-        fault = fault_of(value, hints[field.name], f"`{field.name}`")
+        value = whole(getattr(offer, field.name), hints[field.name], f"`{field.name}`")
         least, most = _RANGES.get(field.name, (0.0, 0.0))
-        if not fault and most and not least <= value <= most:
-            fault = f"`{field.name}` is {value!r}; allowed: {least:g} to {most:g}"
-        if fault:
-            return fault
-    return ""
+        if most and not least <= value <= most:
+            raise PluginError(f"`{field.name}` is {value!r}; allowed: {least:g} to {most:g}")
+        values[field.name] = value
+    return wanted(**values)
 
 
 def _fault_of_executors(offer: MigrationOffer) -> str:

@@ -11,6 +11,7 @@ from operator import methodcaller
 from typing import Any, Final
 
 from rosrm.errors import PluginError
+from rosrm.extensions.answers import exact, exact_fields
 from rosrm.extensions.contracts import Executor, Launcher, Probe, ProbeOffer
 from rosrm.extensions.guard import guarded
 from rosrm.model.description_checks import resource_fault
@@ -165,6 +166,22 @@ def missing_method(kind: PluginKind, thing: object) -> str:
     return ""
 
 
+def taken_resources(described: Iterable[Any]) -> tuple[Any, ...]:
+    """Return copies of the resources that a probe describes; what is none of them stays."""
+    return tuple(
+        exact_fields(one, ResourceDescription) if isinstance(one, ResourceDescription) else one
+        for one in islice(described, RESOURCE_SLOTS + 1)
+    )
+
+
+def taken_labels(given: Any) -> Any:
+    """Return a copy of the labels of a probe; what is no mapping stays."""
+    if not isinstance(given, Mapping):
+        return given
+    some = islice(given.items(), _MOST_LABELS + 1)
+    return {exact(key): exact(value) for key, value in some}
+
+
 def fault_of_resources(
     resources: Sequence[ResourceDescription], offer: ProbeOffer, before: Sequence[MadeProbe]
 ) -> str:
@@ -193,7 +210,7 @@ def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
     """Return why a host cannot have these labels of a probe, as a predicate; "": it can."""
     if not isinstance(labels, Mapping):
         return f'has the labels {labels!r:.100}; a mapping is required, as {{"key": "value"}}'
-    for key, value in islice(labels.items(), _MOST_LABELS + 1):
+    for key, value in labels.items():
         if not (key and _is_text(key) and _is_text(value)):
             return (
                 f"has the label {key!r:.100}: {value!r:.100}; printable text of at most "

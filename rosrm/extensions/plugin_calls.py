@@ -238,9 +238,9 @@ def required(answer: object, kind: type[T]) -> T:
 
     A text is returned as a printable `str` of bounded length; newlines stay.
     """
-    if not isinstance(answer, kind):
+    if not issubclass(type(answer), kind):  # `isinstance` believes its `__class__`
         raise PluginError(f"answered {given(answer)}; {kind.__name__} is required")
-    return cast(T, plain_text(answer, lines=True)) if kind is str else answer
+    return cast(T, plain_text(answer, lines=True) if kind is str else answer)
 
 
 def with_place(fault: PluginError, owner: object, method: str) -> str:

@@ -10,7 +10,6 @@ import logging
 import re
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import cache, partial
-from itertools import islice
 from typing import Any, Final, TypeVar, cast
 
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
@@ -59,6 +58,8 @@ from rosrm.extensions.made import (
     fault_of_labels,
     fault_of_resources,
     missing_method,
+    taken_labels,
+    taken_resources,
     unmeasured,
 )
 from rosrm.extensions.options import merged_options
@@ -69,7 +70,6 @@ from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.rows import PluginKind, PluginRow, PluginState
 from rosrm.model.values import (
     EMPTY,
-    RESOURCE_SLOTS,
     MigrationPolicy,
     ProcessSpec,
     ResourceDescription,
@@ -442,8 +442,8 @@ class Registry:
         probe = self._make("probe", name, options, context)
 
         def described() -> tuple[tuple[ResourceDescription, ...], dict[str, str]]:
-            resources = tuple(islice(probe.resources, RESOURCE_SLOTS + 1))
-            labels = probe.labels if implements(probe, HostLabelling) else EMPTY
+            resources = taken_resources(probe.resources)
+            labels = taken_labels(probe.labels) if implements(probe, HostLabelling) else EMPTY
             fault = (
                 fault_of_resources(resources, offer, before)
                 or unmeasured(probe, resources)

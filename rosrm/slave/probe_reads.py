@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import fields
 from itertools import islice
 from typing import Any, Final
 
 from rosrm.errors import PluginError
+from rosrm.extensions.answers import exact_fields
 from rosrm.extensions.contracts import Probe
 from rosrm.extensions.plugin_calls import given, required
 from rosrm.model.devices import Device, device_fault
@@ -81,7 +81,7 @@ def read_processes(probe: Probe, resources: Sequence[ResourceDescription]) -> Us
     if unknown or missing:
         which = "announces no" if unknown else "lacks the attributed"
         raise PluginError(f"by_process() {which} {', '.join(map(str, unknown or missing))}")
-    return {name: _amounts(name, _mapping(used)) for name, used in answer.items()}
+    return {name: _amounts(name, _mapping(answer[name])) for name in names & answer.keys()}
 
 
 def read_devices(probe: Probe) -> tuple[Device, ...]:
@@ -96,18 +96,14 @@ def read_devices(probe: Probe) -> tuple[Device, ...]:
     answer: object = find()
     if not isinstance(answer, Iterable):
         raise PluginError(f"devices() answered {given(answer)}; a list of Devices is required")
-    devices = tuple(_plain(required(one, Device)) for one in islice(answer, MOST_DEVICES + 1))
+    some = islice(answer, MOST_DEVICES + 1)
+    devices = tuple(exact_fields(required(one, Device), Device) for one in some)
     if len(devices) > MOST_DEVICES:
         raise PluginError(f"devices() answered more than {MOST_DEVICES} devices")
     fault = device_fault(devices)
     if fault:
         raise PluginError(f"devices(): {fault}")
     return devices
-
-
-def _plain(device: Device) -> Device:
-    """Return a device of a subclass as one of the class itself, because copies are made of it."""
-    return Device(*(getattr(device, field.name) for field in fields(Device)))
 
 
 def _mapping(answer: object) -> Mapping[Any, Any]:

@@ -9,11 +9,11 @@ import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, cast
 
 from rosrm import clocks
 from rosrm.errors import LaunchError, PluginError, RosrmError
-from rosrm.extensions.answers import whole
+from rosrm.extensions.answers import MOST_VALUES, exact, whole
 from rosrm.extensions.contracts import (
     Capabilities,
     GraphDepartureLauncher,
@@ -23,7 +23,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import MadeLauncher, MadeLaunchers
-from rosrm.extensions.plugin_calls import PluginCalls, implements, required, titled
+from rosrm.extensions.plugin_calls import PluginCalls, given, implements, required, titled
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 
 T = TypeVar("T")
@@ -135,7 +135,9 @@ class Launchers:
             )
 
         def ask() -> Launch | None:
-            prepared = launcher.prepare(launch)
+            # A launcher may change its copy, and return it.
+            own = replace(launch, environment=dict(launch.environment))
+            prepared = launcher.prepare(own)
             return None if prepared is None else _checked(launch, required(prepared, Launch))
 
         try:
@@ -204,13 +206,12 @@ class Launchers:
         """Return the answer of a launcher, or another one where the call fails."""
 
         def ask() -> T:
-            answer: Any = getattr(launcher, method)(argument)
-            if hint is Sequence[int] and isinstance(answer, Sequence):
-                if len(answer) > MOST_MEMBERS:
-                    raise PluginError(f"{len(answer)} processes; allowed: {MOST_MEMBERS}")
-                answer = tuple(islice(answer, MOST_MEMBERS))
-            whole(answer, hint, method)
+            answer = whole(getattr(launcher, method)(argument), hint, method)
+            if hint is object:  # that is, none is needed
+                return otherwise
             pids = answer if isinstance(answer, tuple) else (answer,) if hint is int else ()
+            if len(pids) > MOST_MEMBERS:
+                raise PluginError(f"{len(pids)} processes; allowed: {MOST_MEMBERS}")
             wrong = [pid for pid in pids if not 0 < pid <= _HIGHEST_PID]
             if wrong:
                 raise PluginError(f"{method} has {wrong[0]!r:.30}, which is no pid")
@@ -223,10 +224,13 @@ class Launchers:
 
 def _checked(launch: Launch, prepared: Launch) -> Launch:
     """Return the launch with the prepared command line and environment; raise `PluginError`."""
-    given: Any = prepared
-    if not isinstance(given.argv, list | tuple) or not isinstance(given.environment, Mapping):
+    words: object = prepared.argv
+    variables: object = prepared.environment
+    if not isinstance(words, list | tuple) or not isinstance(variables, Mapping):
         raise PluginError("`argv` has to be a tuple, and `environment` a mapping")
-    argv, environment = tuple(given.argv), dict(given.environment)
+    argv = tuple(map(_text, islice(words, MOST_VALUES)))
+    pairs = islice(variables.items(), MOST_VALUES)
+    environment = {_text(name): _text(text) for name, text in pairs}
     # The slave's own variables may have bytes that are no UTF-8; the supervisor passes them on.
     whole([one for one in argv if one not in launch.argv], list[str], "argv")
     own = launch.environment
@@ -240,8 +244,15 @@ def _checked(launch: Launch, prepared: Launch) -> Launch:
     odd = next((one for one in added if not one or "=" in one), None)
     if odd is not None:
         raise PluginError(f"`environment` has the name {odd!r:.100}, which no variable can have")
-    words = (*argv, *environment, *environment.values())
-    size = sum(len(os.fsencode(one)) + 1 for one in words)
+    texts = (*argv, *environment, *environment.values())
+    size = sum(len(os.fsencode(one)) + 1 for one in texts)
     if size > MOST_BYTES:
         raise PluginError(f"`argv` and `environment` have {size} bytes; allowed: {MOST_BYTES}")
     return replace(launch, argv=argv, environment=environment)
+
+
+def _text(word: object) -> str:
+    """Return a word as a `str` itself, which may have bytes that are no UTF-8."""
+    if not issubclass(type(word), str):
+        raise PluginError(f"{given(word)} in `argv` or `environment`; text is required")
+    return cast(str, exact(word))

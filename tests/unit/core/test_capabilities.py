@@ -155,6 +155,20 @@ def test_hosts_with_another_capability_are_no_destinations():
     assert cluster.where("p") == ["c"]
 
 
+def test_a_check_that_changes_the_capabilities_changes_its_own_copies(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The master keeps what a host has answered once, for each later comparison."""
+
+    def host_fault(_self: object, source: dict[str, str], destination: dict[str, str]) -> str:
+        return "" if source.pop("version") == destination.pop("version") else "it differs"
+
+    monkeypatch.setattr(Freezing, "host_fault", host_fault)
+    cluster = frozen(Host("a"), busy("b", "4.1"))
+    for _ in range(2):
+        assert "it differs" in cluster.migrate("p", "b").message
+
+
 def test_hosts_without_the_plugin_are_no_destinations() -> None:
     """The master does not probe them; a refusal names them together."""
     cluster = frozen(Host("a"), *(Machine(name, busy={"memory": 0.5}) for name in "bcde"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from decimal import Decimal
+from itertools import repeat
 from typing import Any
 
 import pytest
@@ -191,6 +192,15 @@ def test_a_choice_of_similar_types_is_ordered_in_the_declared_ones():
     order = cluster.orders(ReplicateSnapshot)[-1]
     assert order.hosts == (others(cluster)[0],)
     assert (type(order.every), order.every) == (float, 2.5)
+
+
+def test_a_choice_of_endless_hosts_costs_one_call():
+    """No alarm ends the loop in C that would make a tuple of them."""
+    policy = Asked()
+    cluster = running(policy, "a", "b")
+    policy.answer = CheckpointChoice(repeat(others(cluster)[0]))  # type: ignore[arg-type]
+    cluster.wait(5.0)
+    assert cluster.recorded("plugin_failed")
 
 
 @pytest.mark.parametrize("answer", [None, ValueError("no idea"), TimeoutError("late")])

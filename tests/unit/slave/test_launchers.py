@@ -134,6 +134,42 @@ def test_a_launch_that_no_order_can_hold_refuses_the_start(changes):
         launchers(ours=Wordy()).prepare(launch("ours"))
 
 
+@pytest.mark.parametrize(
+    "variables", [{"A=B": "1"}, {"A": "a\0b"}, {"": "1"}, {"A": "x\ud800"}, {"A": 3}]
+)
+def test_a_launch_that_is_changed_in_its_place_is_checked_as_any_other(variables):
+    """The checks compare it with the launch of the slave, which the launcher cannot change."""
+
+    class Changing:
+        def prepare(self, launch):
+            launch.environment.update(variables)
+            return launch
+
+    own = launch("ours")
+    with pytest.raises(LaunchError, match=r"NUL|name|UTF-8|is required"):
+        launchers(ours=Changing()).prepare(own)
+    assert own.environment == {}
+
+
+def test_a_prepared_launch_has_no_methods_of_the_plugin():
+    """The slave compares and encodes its texts, and sends them to the supervisor."""
+
+    class Equal(str):
+        __slots__ = ()
+        __hash__ = str.__hash__
+
+        def __eq__(self, _other):
+            return True
+
+    class Odd:
+        def prepare(self, launch):
+            return replace(launch, argv=(Equal("y"),), environment={Equal("A"): Equal("1")})
+
+    prepared = launchers(ours=Odd()).prepare(launch("ours"))
+    assert {type(one) for one in (*prepared.argv, *prepared.environment)} == {str}
+    assert {type(one) for one in prepared.environment.values()} == {str}
+
+
 def test_a_launcher_that_leads_a_session_names_its_members(tmp_path):
     """They count to the instance, wherever they are; of other sessions the table finds them."""
     known = launchers(ours=Restorer())

@@ -27,6 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from itertools import islice
 from typing import Final
 
 from rosrm.core.master import events as happened
@@ -37,6 +38,7 @@ from rosrm.core.master.state.pending_orders import Replication
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.core.master.state.replicas import Replica, ReplicationOrder
 from rosrm.errors import PluginError
+from rosrm.extensions.answers import exact
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.event_kinds import EventKind
@@ -274,7 +276,8 @@ def sound_choice(choice: CheckpointChoice | None, view: CheckpointView) -> Check
     if choice is None:
         return None
     required(choice, CheckpointChoice)
-    choice = CheckpointChoice(tuple(choice.hosts), float(choice.every))
+    hosts = tuple(map(exact, islice(choice.hosts, len(view.hosts) + 1)))
+    choice = CheckpointChoice(hosts, float(choice.every))
     strange = [name for name in choice.hosts if name not in view.hosts or name == view.host]
     if strange or len(set(choice.hosts)) != len(choice.hosts):
         raise PluginError(

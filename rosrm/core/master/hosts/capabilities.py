@@ -119,7 +119,8 @@ def fault(state: MasterState, strategy: str, source: Host, destination: Host) ->
     asked = checking
     try:
         return state.plugins.ask(
-            "migration", strategy, "host_fault", lambda: required(asked.host_fault(*facts), str),
+            "migration", strategy, "host_fault",
+            lambda: required(asked.host_fault(*map(dict, facts)), str),  # copies, to change freely
             asked,
         )  # fmt: skip
     except PluginError as error:
