@@ -34,7 +34,13 @@ class ConfigError(RosrmError):
 
 
 class PluginError(RosrmError):
-    """A plugin cannot be imported, raised, hung or returned an invalid value."""
+    """A plugin cannot be imported, raised, hung or returned an invalid value.
+
+    Attributes:
+        was_raised: True: the text describes an exception of the plugin; False: it is rosrm's own.
+    """
+
+    was_raised = False
 
 
 class Refused(RosrmError):
@@ -110,6 +116,26 @@ class SkipPlugin(Exception):
     """Raised by a plugin's `create` if it is absent on this host; the text gives the reason."""
 
 
+class PluginInterrupt(BaseException):
+    """Interrupt of an overdue call of a plugin; no `Exception`, because plugins catch these.
+
+    Attributes:
+        place: file and line of the plugin that was interrupted; "": not known yet.
+    """
+
+    place = ""
+
+
+class PluginTimeout(TimeoutError):
+    """The call of a plugin took too long.
+
+    Attributes:
+        place: as in `PluginInterrupt`.
+    """
+
+    place = ""
+
+
 # --- exceptions of plugins ----------------------------------------------------------------------
 
 
@@ -149,8 +175,15 @@ def describe_plugin_fault(fault: BaseException) -> str:
     """
     if type(fault) is PluginError:
         return str(fault)
-    place = sanitized(_text_of(lambda: place_in_plugin(fault)), _LONGEST_PLACE)
+    place = describe_place(fault)
+    if type(fault) is PluginTimeout:
+        fault = TimeoutError(*fault.args)
     return describe_fault(fault) + (f" ({place})" if place else "")
+
+
+def describe_place(fault: BaseException) -> str:
+    """Return the place in the plugin that raised an exception, printable and bounded; or ""."""
+    return sanitized(_text_of(lambda: place_in_plugin(fault)), _LONGEST_PLACE)
 
 
 def place_in_rosrm(fault: BaseException) -> str:
@@ -160,7 +193,10 @@ def place_in_rosrm(fault: BaseException) -> str:
 
 def place_in_plugin(fault: BaseException) -> str:
     """Return file and line of the plugin's own innermost frame; "" if rosrm raised the fault."""
-    return _innermost_of_plugin(_frames(fault))
+    known = ""
+    if type(fault) is PluginInterrupt or type(fault) is PluginTimeout:
+        known = fault.place
+    return known or _innermost_of_plugin(_frames(fault))
 
 
 def place_in_stack(frame: FrameType | None, guard: FrameType | None) -> str:

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Final, NamedTuple, Protocol, TypeVar
 
-from rosrm.errors import PluginError, describe_plugin_fault
-from rosrm.extensions.plugin_calls import Answers, Plugin, contained, titled
+from rosrm.errors import PluginError
+from rosrm.extensions.plugin_calls import Answers, Plugin, contained, raise_alone, raised, titled
 from rosrm.extensions.process_state import Interrupts, ProcessState
 from rosrm.extensions.time_limit import CALL_LIMIT, end_limit, limited
 from rosrm.wording import listed
@@ -94,7 +94,8 @@ def guarded(
     try:
         return limited(seconds, partial(in_process, whom, hook, inner), text)
     except TimeoutError as fault:
-        raise PluginError(describe_plugin_fault(fault)) from fault
+        error = raised(fault)
+    return raise_alone(error)
 
 
 def limit_of_one_call(plugin: Plugin, call: Callable[[], T]) -> T:
@@ -115,14 +116,10 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
     slot, pid = 0 if _notes is None else _notes.begin(whom, hook), os.getpid()
     try:
         if threading.current_thread() is not threading.main_thread():
-            return _without_interrupt(call)
+            return _called(call, lambda: False)  # the user's reaches the main thread alone
         before, interrupts = ProcessState(whole=not often), Interrupts()
         try:
-            return call()
-        except KeyboardInterrupt as fault:
-            if interrupts.pressed:
-                raise
-            raise PluginError(describe_plugin_fault(fault)) from fault
+            return _called(call, lambda: interrupts.pressed)
         finally:
             end_limit()
             interrupts.end()
@@ -143,8 +140,11 @@ def _say_changed(whom: str, changed: str) -> None:
     _log.warning("%s has changed %s, restored now", whom, changed)
 
 
-def _without_interrupt(call: Callable[[], T]) -> T:
+def _called(call: Callable[[], T], is_users: Callable[[], bool]) -> T:
     try:
         return call()
-    except KeyboardInterrupt as fault:  # the user's reaches the main thread alone
-        raise PluginError(describe_plugin_fault(fault)) from fault
+    except KeyboardInterrupt as fault:
+        if is_users():
+            raise
+        error = raised(fault)
+    return raise_alone(error)

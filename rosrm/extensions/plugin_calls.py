@@ -21,9 +21,15 @@ from functools import partial
 from inspect import getattr_static, unwrap
 from math import inf
 from types import CodeType, MemberDescriptorType
-from typing import Any, Final, TypeGuard, TypeVar, cast
+from typing import Any, Final, NoReturn, TypeGuard, TypeVar, cast
 
-from rosrm.errors import PluginError, describe_plugin_fault, plain_text
+from rosrm.errors import (
+    PluginError,
+    PluginInterrupt,
+    describe_place,
+    describe_plugin_fault,
+    plain_text,
+)
 from rosrm.model.rows import PluginKind
 from rosrm.wording import counted, duration
 
@@ -133,7 +139,7 @@ class PluginCalls:
         except KeyboardInterrupt:  # the user's Ctrl-C in a command or simulation
             raise
         except BaseException as fault:  # a late call; `contained` has converted any other
-            if isinstance(fault, lets):
+            if answer_of(fault, lets) is not None:
                 raise
             reason = describe_plugin_fault(fault)
             self.note(plugin, hook, f"{hook}: {reason}")
@@ -203,15 +209,50 @@ def contained(call: Callable[[], T], *, of: object = None, hook: str = "", lets:
         return call()
     except KeyboardInterrupt:
         raise
-    except BaseException as fault:
-        # By its exact type, because a plugin may raise an error of its own with any methods.
-        if type(fault) is PluginError:
-            said = PluginError(plain_text(_said(fault), lines=True))
-            raise PluginError(with_place(said, of, hook)) from None
-        answer = next((one for one in lets if isinstance(fault, one)), None)
-        if answer is not None:
-            raise answer(plain_text(_said(fault), lines=True)) from None
-        raise PluginError(describe_plugin_fault(fault)) from fault
+    except BaseException as fault:  # noqa: BLE001 - see above
+        error = _converted(fault, of, hook, lets)
+    return raise_alone(error)
+
+
+def raise_alone(error: BaseException) -> NoReturn:
+    """Raise an error, outside of any `except` clause, without a cycle through its traceback.
+
+    The exception of a plugin is dropped before. Otherwise the objects in the plugin's frames would
+    end after the guard, and the end of a connection may block.
+    """
+    try:
+        raise error
+    finally:
+        del error
+
+
+def raised(fault: BaseException) -> PluginError:
+    """Return a `PluginError` about an exception of a plugin."""
+    error = PluginError(describe_plugin_fault(fault))
+    error.was_raised = True
+    return error
+
+
+def _converted(
+    fault: BaseException, of: object, hook: str, lets: Answers
+) -> PluginError | Exception:
+    # By its exact type, because a plugin may raise an error of its own with any methods.
+    if type(fault) is PluginError:
+        said = PluginError(plain_text(_said(fault), lines=True))
+        return PluginError(with_place(said, of, hook))
+    if type(fault) is PluginInterrupt:
+        fault.place = describe_place(fault)
+        BaseException.with_traceback(fault, None).__context__ = None
+    answer = answer_of(fault, lets)
+    return raised(fault) if answer is None else answer(plain_text(_said(fault), lines=True))
+
+
+def answer_of(fault: BaseException, lets: Answers) -> type[Exception] | None:
+    """Return the class of answers by contract to which an exception belongs; None: it is a fault.
+
+    Unlike `isinstance`, this does not read `__class__`, which may be a property of the plugin.
+    """
+    return next((one for one in lets if issubclass(type(fault), one)), None)
 
 
 def _said(fault: BaseException) -> str:

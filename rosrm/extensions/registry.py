@@ -467,7 +467,7 @@ class Registry:
         try:
             return guarded(call, whom=titled(kind, name), hook=hook, lets=lets)
         except PluginError as fault:
-            own = fault.__cause__ is None  # rosrm's sentence on an invalid answer
+            own = not fault.was_raised  # rosrm's sentence on an invalid answer
             raise self._fault(
                 kind, name, str(fault) if own else f"its `{hook}` raised {fault}"
             ) from fault

@@ -22,7 +22,8 @@ from types import FrameType
 from typing import Any, ClassVar, Final, TypeVar
 
 from rosrm import clocks, threads
-from rosrm.errors import place_in_stack
+from rosrm.errors import PluginInterrupt, PluginTimeout, place_in_stack
+from rosrm.extensions.plugin_calls import raise_alone
 
 T = TypeVar("T")
 
@@ -54,8 +55,8 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
     _Watch.ensure()
     try:
         return _limited(seconds, call, late)
-    except _Interrupt:  # of the watch, at the very end of the call
-        raise TimeoutError(late()) from None
+    except PluginInterrupt:  # of the watch, at the very end of the call
+        raise PluginTimeout(late()) from None
 
 
 def end_limit() -> None:
@@ -85,8 +86,10 @@ def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> 
         if left:
             signal.setitimer(signal.ITIMER_REAL, left, interval)
         if alarm.interrupt is not None:
-            # The traceback has the place in the plugin at which the call was interrupted.
-            raise TimeoutError(late()).with_traceback(alarm.interrupt.__traceback__) from None
+            # Either has the place in the plugin at which the call was interrupted.
+            fault = PluginTimeout(late()).with_traceback(alarm.interrupt.__traceback__)
+            fault.place, alarm.interrupt = alarm.interrupt.place, None
+            raise_alone(fault)
 
 
 def _ring(number: int, frame: FrameType | None) -> None:
@@ -105,10 +108,6 @@ def _is_own(frame: FrameType | None) -> bool:
     return frame is not None and frame.f_code.co_filename in _OWN
 
 
-class _Interrupt(BaseException):
-    """Interrupt of an overdue call; no `Exception`, because plugins catch these."""
-
-
 class _Alarm:
     """The interrupts of one call.
 
@@ -125,7 +124,7 @@ class _Alarm:
     ringing: ClassVar[_Alarm | None] = None
 
     def __init__(self, guard: FrameType | None, deadline: float) -> None:
-        self.interrupt: _Interrupt | None = None
+        self.interrupt: PluginInterrupt | None = None
         self.deadline = deadline
         self._was_forced = False
         self._guard = guard
@@ -165,9 +164,12 @@ class _Alarm:
         if callable(handler):  # ends a blocking call; the default action would end the process
             signal.pthread_kill(main, signal.SIGALRM)
 
-    def _next_interrupt(self) -> _Interrupt:
-        self.interrupt = _Interrupt("a plugin was interrupted, because its call took too long")
-        return self.interrupt
+    def _next_interrupt(self) -> PluginInterrupt:
+        new = PluginInterrupt("a plugin was interrupted, because its call took too long")
+        if self.interrupt is not None:  # the end of an object of the plugin may be late, too
+            new.place = self.interrupt.place
+        self.interrupt = new
+        return new
 
     def _log_place(self, frame: FrameType | None) -> None:
         now = clocks.awake_time()
@@ -231,4 +233,6 @@ def interrupt_thread(ident: int) -> None:
     """Raise an exception in a thread at its next line of Python; a blocking call is not ended."""
     import ctypes  # noqa: PLC0415 - seldom needed, and the runtimes' memory is budgeted
 
-    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(ident), ctypes.py_object(_Interrupt))
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(
+        ctypes.c_ulong(ident), ctypes.py_object(PluginInterrupt)
+    )

@@ -420,5 +420,4 @@ class _Watched:
         try:
             return guarded(ask, whom=self._title, hook=name, of=self._probe), ""
         except PluginError as fault:
-            is_answer = fault.__cause__ is None  # the sentence is rosrm's, on an invalid answer
-            return None, str(fault) if is_answer else f"{name}() raised {fault}"
+            return None, f"{name}() raised {fault}" if fault.was_raised else str(fault)

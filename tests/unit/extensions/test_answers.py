@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import count
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 from unittest.mock import Mock
 
 import pytest
@@ -147,31 +147,27 @@ def test_an_offer_stays_as_it_was_registered() -> None:
 
 def test_the_variables_of_a_launcher_are_those_of_its_registration() -> None:
     """Each start of a process reads them."""
-    variables: list[str] = ["OURS"]
     offer = LauncherOffer("ours", lambda _: SimpleNamespace(prepare=None), variables=("X",))
-    object.__setattr__(offer, "variables", Variables(variables))
+    object.__setattr__(offer, "variables", Variables())
     registry = _registry(offer, "register_launchers")
-    variables.append(3)  # type: ignore[arg-type]
+    Variables.items.append(3)  # type: ignore[arg-type]
     assert registry.launchers(None).made["ours"].variables == ("OURS",)  # type: ignore[arg-type]
 
 
 class Variables(tuple):  # type: ignore[type-arg] # noqa: SLOT001
     """A tuple with the items of a list."""
 
-    def __new__(cls, items: list[str]) -> Variables:
-        made = super().__new__(cls)
-        made.items = items  # type: ignore[attr-defined]
-        return made
+    items: ClassVar[list[str]] = ["OURS"]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.items)  # type: ignore[attr-defined]
+        return iter(self.items)
 
 
 class OddProbe:
     """A probe whose description and labels have methods of its own."""
 
     resources = (ResourceDescription(OddText("x"), OddText("1"), OddFraction(0.5), "machine"),)
-    labels = {OddText("room"): OddText("lab")}
+    labels: ClassVar = {OddText("room"): OddText("lab")}
 
     def read(self) -> list[Reading]:
         return [Reading("x", 0.5)]
@@ -206,11 +202,11 @@ def test_usage_is_taken_of_the_announced_resources_alone() -> None:
     """Another name would end the loop, which looks for its slot."""
     probe = SimpleNamespace(by_process=lambda: Growing(x={1: 2.0}))
     described = [ResourceDescription("x", "1", 1.0, "machine")]
-    assert read_processes(probe, described) == {"x": {1: 2.0}}  # type: ignore[arg-type]
+    assert read_processes(probe, described) == {"x": {1: 2.0}}
 
 
 def test_devices_have_no_methods_of_the_plugin() -> None:
     """Their texts are in the registration, and in listings."""
     found = Device("gpu", OddText("a"), about=OddText("fast"))
-    (device,) = read_devices(SimpleNamespace(devices=lambda: [found]))  # type: ignore[arg-type]
+    (device,) = read_devices(SimpleNamespace(devices=lambda: [found]))
     assert (type(device.unit), type(device.about)) == (str, str)

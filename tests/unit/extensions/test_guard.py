@@ -25,7 +25,7 @@ from rosrm.errors import ConfigError, PluginError, SkipPlugin
 from rosrm.extensions.answers import whole
 from rosrm.extensions.discovery import definition
 from rosrm.extensions.guard import guarded
-from rosrm.extensions.plugin_calls import PluginCalls, required
+from rosrm.extensions.plugin_calls import Answers, PluginCalls, required
 from rosrm.extensions.plugin_deadline import Deadlines
 from rosrm.extensions.process_state import ProcessState
 from rosrm.runtime.crash_notes import kept_notes
@@ -73,14 +73,14 @@ ERRORS: list[BaseException] = [
 ]  # fmt: skip
 
 
-def _by_guard(call: Callable[[], Any]) -> Any:
-    return guarded(call, whom="filter 'odd'", hook="mask")
+def _by_guard(call: Callable[[], Any], lets: Answers = ()) -> Any:
+    return guarded(call, whom="filter 'odd'", hook="mask", lets=lets)
 
 
-def _by_ask(call: Callable[[], Any]) -> Any:
+def _by_ask(call: Callable[[], Any], lets: Answers = ()) -> Any:
     calls = PluginCalls(Deadlines(5.0))
     try:
-        return calls.ask(*PLUGIN, "mask", call)
+        return calls.ask(*PLUGIN, "mask", call, lets=lets)
     finally:
         ((plugin, error),) = calls.changes(0.0)
         assert plugin == PLUGIN
@@ -91,13 +91,13 @@ def _by_deadline(call: Callable[[], Any]) -> Any:
     return PluginCalls(Deadlines(5.0)).ask(*PLUGIN, "mask", call)
 
 
-def _by_thread(call: Callable[[], Any]) -> Any:
+def _by_thread(call: Callable[[], Any], lets: Answers = ()) -> Any:
     """Call a plugin in a thread, as a probe, an executor or a sink."""
     outcome: list[BaseException] = []
 
     def run() -> None:
         try:
-            _by_guard(call)
+            _by_guard(call, lets)
         except BaseException as fault:  # noqa: BLE001 - raised in the test
             outcome.append(fault)
 
@@ -122,6 +122,66 @@ def test_whatever_a_plugin_raises_costs_one_call(error: BaseException, way: Any)
     with pytest.raises(PluginError) as caught:
         way(fail)
     assert _is_plain(str(caught.value))
+
+
+class Unclassified(Exception):
+    """An error whose class is a property that raises."""
+
+    @property
+    def __class__(self) -> Any:
+        raise Base
+
+    @__class__.setter
+    def __class__(self, _kind: object) -> None:
+        """Do nothing."""
+
+
+@pytest.mark.parametrize("way", [_by_guard, _by_ask, _by_thread])
+def test_an_error_that_hides_its_class_is_contained_beside_answers_by_contract(way: Any) -> None:
+    """`isinstance` reads `__class__` of an exception, which runs code of the plugin."""
+
+    def fail() -> None:
+        raise Unclassified
+
+    with pytest.raises(PluginError, match="Unclassified"):
+        way(fail, lets=(ValueError,))
+
+
+class Connection:
+    """An object of a plugin whose end blocks."""
+
+    ended: float = 0.0
+
+    def __del__(self) -> None:
+        Connection.ended = time.monotonic()
+        while time.monotonic() < Connection.ended + 20.0:
+            time.sleep(0.01)
+
+
+def _fail() -> None:
+    _kept = Connection()
+    raise ValueError("no")
+
+
+def _hang() -> None:
+    _kept = Connection()
+    while True:
+        time.sleep(0.01)
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("fail", [_fail, _hang])
+def test_the_objects_of_a_call_that_failed_end_within_its_time_out(
+    fail: Callable[[], None],
+) -> None:
+    """The end of a connection may block, and nothing would interrupt it after the guard."""
+    began = time.monotonic()
+    Connection.ended = 0.0
+    with pytest.raises(PluginError, match=rf"{__file__}:\d+") as caught:
+        PluginCalls(Deadlines(0.3)).ask(*PLUGIN, "mask", fail)
+    assert Connection.ended > 0.0
+    del caught
+    assert time.monotonic() - began < 10.0
 
 
 def test_a_fault_names_file_and_line_of_the_plugin() -> None:
