@@ -16,6 +16,7 @@ failing   each method that failed has succeeded       `selected`; a record
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from functools import partial
 from inspect import getattr_static, unwrap
@@ -92,6 +93,11 @@ class Failing:
         return f"{self.error}; {counted(self.count, 'failure')} so far, the last {age} ago{since}"
 
 
+#: Plugin that is being called in this thread. A slave asks plugins in several threads, and the
+#: call of one thread does not cover that of another one.
+_running: Final[ContextVar[Plugin | None]] = ContextVar("_running", default=None)
+
+
 def _without_limit(_plugin: Plugin, call: Callable[[], Any]) -> Any:
     return call()
 
@@ -109,7 +115,6 @@ class PluginCalls:
     failing: dict[Plugin, Failing] = field(default_factory=dict)
     _failed: dict[Plugin, Failing] = field(default_factory=dict)
     _worked: set[tuple[Plugin, str]] = field(default_factory=set)
-    _running: Plugin | None = None
 
     def ask(
         self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], of: object = None,
@@ -131,9 +136,9 @@ class PluginCalls:
         Raises:
             PluginError: the call failed; the text has the error and its place.
         """
-        plugin, outer = (kind, name), self._running
+        plugin, outer = (kind, name), _running.get()
         placed = partial(contained, call, of=of, hook=hook, lets=lets)
-        self._running = plugin
+        _running.set(plugin)
         try:
             answer: T = placed() if plugin == outer else self.limit(plugin, placed)
         except KeyboardInterrupt:  # the user's Ctrl-C in a command or simulation
@@ -145,7 +150,7 @@ class PluginCalls:
             self.note(plugin, hook, f"{hook}: {reason}")
             raise PluginError(reason) from fault
         finally:
-            self._running = outer
+            _running.set(outer)
         self.note(plugin, hook)
         return answer
 
@@ -169,7 +174,7 @@ class PluginCalls:
         found: list[tuple[Plugin, str]] = []
         failed, self._failed = self._failed, {}
         worked, self._worked = self._worked, set()
-        for plugin, hook in worked:
+        for plugin, hook in list(worked):  # a thread may still note a success
             if known := self.failing.get(plugin):  # a thread may note this after the end
                 known.hooks -= {hook, ""}
         for plugin, noted in list(failed.items()):  # a thread may still note an error

@@ -19,6 +19,7 @@ T = TypeVar("T")
 #: Share of the limit from which on a call counts as slow: a busy machine delays quick ones, too.
 _SLOW: Final = 0.25
 #: Limits that the slow calls of one plugin may take together; a tenth of the time is given back.
+#: All calls in one turn of the loop may take as long, because a thousand of them may be quick.
 #: With the default lease of 10 s a plugin holds the loop for half of it at most.
 _MOST_SLOW: Final = 4.0
 _GIVEN_BACK: Final = 0.1
@@ -63,9 +64,14 @@ class Deadlines:
         self._seconds = seconds
         self._pause = pause
         self._accounts: dict[Plugin, _Account] = {}
+        self._in_turn: dict[Plugin, float] = {}
         self.spent = 0.0
         if threading.current_thread() is not threading.main_thread():
             raise RuntimeError("the deadlines work by a signal and need the main thread")
+
+    def begin_turn(self) -> None:
+        """Begin a turn of the loop, between which the part serves its peers."""
+        self._in_turn.clear()
 
     def __call__(self, plugin: Plugin, call: Callable[[], T]) -> T:
         """Return the answer of a call; raises `PluginError` or the plugin's own exception."""
@@ -83,8 +89,11 @@ class Deadlines:
         finally:
             took = clocks.awake_time() - began
             self.spent += took
+            in_turn = self._in_turn[plugin] = self._in_turn.get(plugin, 0.0) + took
             if took > self._seconds * _SLOW:
                 self._charge(plugin, took)
+            if in_turn > self._seconds * _MOST_SLOW:
+                self._pause_because(plugin, in_turn)
         if account is not None and account.until < began:
             account.pause = 0.0
         return answer
@@ -101,9 +110,15 @@ class Deadlines:
         account, now = self._accounts.setdefault(plugin, _Account()), clocks.awake_time()
         account.slow = max(0.0, account.slow - (now - account.at) * _GIVEN_BACK) + took
         account.at = now
-        if account.slow > self._seconds * _MOST_SLOW and account.until < now:
+        if account.slow > self._seconds * _MOST_SLOW:
+            self._pause_because(plugin, account.slow)
+
+    def _pause_because(self, plugin: Plugin, took: float) -> None:
+        """Begin a pause because of many calls, unless a late one has begun it."""
+        account = self._accounts.setdefault(plugin, _Account())
+        if account.until < clocks.awake_time():
             account.text = (
-                f"its calls took {account.slow:.1f} s within a short time, and it is not asked "
+                f"its calls took {took:.1f} s within a short time, and it is not asked "
                 f"again for {self._begin_pause(plugin):g} s"
             )
 

@@ -332,6 +332,7 @@ class MasterRuntime:
                 while self._from_threads:
                     self._participant.guard.call(self._from_threads.popleft())
                 now = self._now()
+                self._deadlines.begin_turn()
                 self._leave_out_suspend()
                 if now >= next_tick:
                     next_tick = now + _TICK

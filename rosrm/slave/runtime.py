@@ -160,7 +160,7 @@ class SlaveRuntime:
                 LauncherContext(config.state, sys.executable, self._incarnation)
             )
             self._calls = registry.calls
-            self._calls.limit = Deadlines(ASK_LIMIT)
+            self._calls.limit = self._deadlines = Deadlines(ASK_LIMIT)
             launchers = Launchers.of(offered, registry.capabilities_or_fault(), self._calls)
             self._launchers = tuple(launchers.made)
             sessions = SessionTable(launchers=launchers)
@@ -377,6 +377,7 @@ class SlaveRuntime:
         next_sample = next_usage = next_graph = next_health = next_devices = now
         logged_at = now - _LOG_PERIOD
         while condition():
+            self._deadlines.begin_turn()
             if now >= next_sample:
                 next_sample = max(next_sample + self._config.period, now)
                 self._cycle(now)

@@ -412,6 +412,50 @@ def test_a_plugin_that_is_often_slow_is_not_called_for_a_while() -> None:
         slow_calls()
 
 
+def test_a_plugin_holds_one_turn_of_the_loop_for_a_bounded_time() -> None:
+    """A thousand calls of which none is slow would take longer together than a lease."""
+    deadlines = Deadlines(0.3, pause=60.0)
+    calls = PluginCalls(deadlines)
+
+    def turn(number: int) -> None:
+        deadlines.begin_turn()
+        for _ in range(number):
+            calls.ask("filter", "odd", "mask", lambda: time.sleep(0.03))
+
+    for _ in range(3):
+        turn(20)
+    with pytest.raises(PluginError, match="not asked again for 60 s"):
+        turn(100)
+
+
+def test_a_call_in_a_thread_takes_no_limit_from_a_call_of_the_loop() -> None:
+    """The thread of a start asks a strategy or launcher while the loop asks it, too."""
+    calls = PluginCalls(Deadlines(0.3))
+    begun, ended = threading.Event(), threading.Event()
+
+    def in_thread() -> None:
+        def wait() -> None:
+            begun.set()
+            assert ended.wait(30.0), "the call of the loop has not ended"
+
+        calls.ask("launcher", "odd", "prepare", wait)
+
+    def hang() -> None:
+        end = time.monotonic() + 20.0
+        while time.monotonic() < end:
+            time.sleep(0.01)
+
+    thread = threading.Thread(target=in_thread)
+    thread.start()
+    assert begun.wait(30.0), "the thread has not called the plugin"
+    try:
+        with pytest.raises(PluginError, match=r"took longer than 0\.3 s"):
+            calls.ask("launcher", "odd", "leads", hang)
+    finally:
+        ended.set()
+        thread.join(30.0)
+
+
 def test_quick_calls_begin_no_pause() -> None:
     """A policy that decides quickly may decide as often as the master asks."""
     calls = PluginCalls(Deadlines(5.0, pause=60.0))
