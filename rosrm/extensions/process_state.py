@@ -22,12 +22,19 @@ from _signal import getsignal  # type: ignore[import-not-found]
 from collections.abc import Callable
 from typing import Any, Final
 
+from rosrm.wording import sanitized
+
 #: Signals that rosrm handles, or whose default action would end or stop it.
 _SIGNALS: Final = (
     signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGCHLD, signal.SIGPIPE, signal.SIGALRM,
 )  # fmt: skip
 #: Signals whose handler a library in C may replace unseen by Python, as that of ROS does.
 _OF_LIBRARIES: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+#: Most environment variables in a warning, and most letters of each.
+_NAMED: Final = 3
+_LONGEST_NAME: Final = 100
 
 
 class ProcessState:
@@ -39,8 +46,8 @@ class ProcessState:
     """
 
     __slots__ = (
-        "_blocked", "_collects", "_directory", "_disabled", "_handlers", "_level", "_log_handlers",
-        "_settings", "_umask", "_whole",
+        "_blocked", "_collects", "_directory", "_disabled", "_environment", "_handlers", "_level",
+        "_log_handlers", "_settings", "_umask", "_whole",
     )  # fmt: skip
 
     def __init__(self, *, whole: bool = True) -> None:
@@ -57,9 +64,10 @@ class ProcessState:
             os.umask(self._umask)
 
     def keep_own(self) -> None:
-        """Take the present handlers of signals and garbage collection, which rosrm has changed."""
+        """Take what rosrm has changed itself: handlers, environment, garbage collection."""
         self._handlers = [getsignal(number) for number in _SIGNALS]
         self._collects = gc.isenabled(), gc.get_threshold()
+        self._environment = dict(os.environb) if self._whole else {}
 
     def restore(self) -> list[str]:
         """Restore what has changed since; return what it was. No effect in another thread."""
@@ -102,12 +110,25 @@ class ProcessState:
             with contextlib.suppress(OSError):  # removed
                 os.chdir(self._directory)
             changed.append("the working directory")
+        changed += self._restore_environment()
         silenced = [one for one in _own_logs() if one.disabled]  # `dictConfig` does so by default
         for one in silenced:
             one.disabled = False
         if silenced:
             changed.append("the loggers of rosrm")
         return changed
+
+    def _restore_environment(self) -> list[str]:
+        """Restore the variables, which each process of a slave and its supervisor would get."""
+        before, after = self._environment, dict(os.environb)
+        names = sorted({name for name, _ in before.items() ^ after.items()})
+        for name in names:
+            if name in before:
+                os.environb[name] = before[name]
+            else:
+                del os.environb[name]
+        shown = (sanitized(os.fsdecode(name), _LONGEST_NAME) for name in names[:_NAMED])
+        return [f"the environment variable {name}" for name in shown]
 
 
 def _own_logs() -> list[logging.Logger]:

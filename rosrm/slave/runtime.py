@@ -223,6 +223,7 @@ class SlaveRuntime:
         return probes.absent
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
+        self._process.restore()  # each process gets the environment, and so does the supervisor
         self._supervisor = SupervisorLink(
             self._config.state / "supervisor", self._config.logs, post=self._post, take=self._take,
             follow=self._follow_session,

@@ -253,6 +253,8 @@ HARM: dict[str, Callable[[], Any]] = {
     "configuration of the log": _configure_the_log,
     "thresholds of the collection": lambda: gc.set_threshold(0),
     "debugging of the collection": lambda: gc.set_debug(gc.DEBUG_SAVEALL),
+    "environment": lambda: os.environ.update(CUDA_VISIBLE_DEVICES="7", PATH="/odd"),
+    "smaller environment": lambda: os.environ.pop("PATH"),
     "warnings that raise": lambda: warnings.simplefilter("error"),
 }
 
@@ -267,7 +269,7 @@ def _state() -> tuple[object, ...]:
         sys.getswitchinterval(), sys.getrecursionlimit(), gc.isenabled(),
         socket.getdefaulttimeout(), np.geterr(), signal.pthread_sigmask(signal.SIG_BLOCK, ()),
         gc.get_threshold(), gc.get_debug(), "error" in [one[0] for one in warnings.filters],
-        logging.getLogger("rosrm.plugins").disabled,
+        logging.getLogger("rosrm.plugins").disabled, dict(os.environ),
     )  # fmt: skip
     return (
         settings,
