@@ -53,6 +53,8 @@ _PATIENCE: Final = 30.0
 _STEADY: Final = 10.0
 _MOST_BRIEF: Final = 3
 _LONGEST_PAUSE: Final = 60.0
+#: Most seconds for which a status waits for the log of its component.
+_LOG_PATIENCE: Final = 1.0
 #: Seconds for which orders may wait before a message to the user.
 _LOGGED_AFTER: Final = 5.0
 _OF_EARLIER_VERSION: Final = (
@@ -94,6 +96,7 @@ class SupervisorLink:
         self._post, self._take, self._follow, self._ended = post, take, follow, ended
         self._is_shutting_down = False
         self._is_closed = False
+        self._reader: threads.Thread | None = None
         self._leaves = threading.Event()
         self._absence = ""
         self._logged_waits = False
@@ -233,7 +236,8 @@ class SupervisorLink:
         """Receive until the supervisor must be replaced; raises `SupervisorError` at the end."""
         try:
             while True:
-                self._post(partial(self._take_messages, client.receive(None)))
+                received = [self._explained(one) for one in client.receive(None)]
+                self._post(partial(self._take_messages, received))
         except SupervisorError as gone:  # `SupervisorEnded`: by a SIGTERM to it alone
             if self._leaves.is_set():
                 raise
@@ -278,7 +282,7 @@ class SupervisorLink:
 
     def _take_messages(self, received: Sequence[SupervisorMessage]) -> None:
         statuses = tuple(
-            replace(one, message=without_directories(self._explained(one)))
+            replace(one, message=without_directories(one.message))
             for one in received
             if isinstance(one, InstanceStatus)
         )
@@ -290,13 +294,27 @@ class SupervisorLink:
             if isinstance(one, Amended):
                 self._take(events.AmendmentRecorded(one.instance, one.amendment, one.refusal))
 
-    def _explained(self, status: InstanceStatus) -> str:
-        """Return the message of a status, with the reason that a component's process logged."""
+    def _explained(self, one: SupervisorMessage) -> SupervisorMessage:
+        """Return a status with the reason that a component's process logged, if any.
+
+        Called in the thread that receives. The log may be on a disk without an answer, so another
+        thread reads it, and the status waits at most `_LOG_PATIENCE` seconds.
+        """
         code = f"exit code {FAILED}"
-        if not status.message.startswith(code):
-            return status.message
-        fault = fault_in(last_lines(log_path(self.state, status.instance)))
-        return status.message.replace(code, f"{code}: {fault}", 1) if fault else status.message
+        if not isinstance(one, InstanceStatus) or not one.message.startswith(code):
+            return one
+        faults: list[str] = []
+
+        def read() -> None:
+            faults.append(fault_in(last_lines(log_path(self.state, one.instance))))
+
+        if self._reader is None or not self._reader.is_alive():
+            with contextlib.suppress(RuntimeError):  # no further thread: the reason is in the log
+                self._reader = threads.start(read, "log of a component")
+                self._reader.join(_LOG_PATIENCE)
+        if not any(faults):
+            return one
+        return replace(one, message=one.message.replace(code, f"{code}: {faults[0]}", 1))
 
     def take_over(self) -> int:
         """Re-adopt the supervisor's instances, and return their number; no others run."""

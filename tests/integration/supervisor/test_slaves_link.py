@@ -11,14 +11,16 @@ import threading
 import pytest
 
 from rosrm import clocks
+from rosrm.component.link import FAILED, FAULT
 from rosrm.config.settings import LogSettings
 from rosrm.core.slave import commands, events
 from rosrm.errors import SupervisorError
-from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
+from rosrm.model.values import InstanceId, InstanceState, InstanceStatus, RestartPolicy
 from rosrm.slave.supervisor_client import SupervisorLink
 from rosrm.supervisor import send_buffer
 from rosrm.supervisor.client import SupervisorClient
-from tests.waiting import PATIENCE, wait_gone
+from tests.hung_files import hung_files
+from tests.waiting import PATIENCE, wait_gone, wait_until
 
 #: Together more than a socket buffer holds.
 COUNT, LARGE = 10, "x" * 100_000
@@ -62,6 +64,12 @@ class Loop:
     def started(self) -> set[InstanceId]:
         told = [one for one in self.events if isinstance(one, events.SupervisorReported)]
         return {status.instance for one in told for status in one.statuses if status.pid}
+
+    def message(self, name: str) -> str:
+        """Return the message of the end of an instance; "": it has not ended."""
+        told = [one for one in self.events if isinstance(one, events.SupervisorReported)]
+        ended = [one for it in told for one in it.statuses if one.state.ended]
+        return "".join(one.message for one in ended if one.instance.process == name)
 
     def start_many(self) -> None:
         for instance in MANY:
@@ -224,3 +232,27 @@ def test_a_slave_that_can_receive_no_more_ends_with_the_reason(loop, monkeypatch
     os.kill(loop.pid, signal.SIGKILL)
     loop.wait(lambda: loop.ended, "the end of the slave")
     assert "RuntimeError: a bug" in loop.ended[0]
+
+
+def test_the_reason_in_a_log_is_reported_unless_its_disk_hangs(host, caplog, tmp_path) -> None:
+    """The status of a component's process waits for its log only a moment."""
+    script = f"exec < {tmp_path}/go; echo '{FAULT}no such plugin'; read line; exit {FAILED}"
+    os.mkfifo(tmp_path / "go")
+    go = os.open(tmp_path / "go", os.O_RDWR)
+    host.state.mkdir(mode=0o700)
+    with hung_files(tmp_path / "hung") as hung:
+        (host.state / "logs").symlink_to(hung.place)
+        loop = Loop(host, caplog)
+        for name in ("first", "second"):
+            order = host.order(name, "sh", "-c", script, restart=RestartPolicy("never"))
+            loop.link.start([order])
+            loop.wait(lambda name=name: InstanceId(name, 1) in loop.started(), "it runs")
+            wait_until(lambda name=name: FAULT in host.log(name).read_text(), "its output")
+            if name == "second":
+                hung.hang()
+            os.write(go, b"\n")
+            loop.wait(lambda name=name: loop.message(name), "its end")
+            assert ("no such plugin" in loop.message(name)) == (name == "first")
+        hung.answer()
+        loop.link.close()
+    os.close(go)
