@@ -67,7 +67,7 @@ def places(state: MasterState) -> Iterator[str]:
                 yield f"{what} has the owner {process.owner}, or moves"
             if waits and process.instances:
                 yield f"{what} waits, with instances {process.instances}"
-        elif not (moves or process.image is not None or process.owner in state.instances):
+        elif not (moves or process.image is not None or process.owner in process.instances):
             awaits_end = process.wanted is not DesiredState.RUN and process.instances
             if not awaits_end:
                 yield f"{what} has no owner, and waits for no end"

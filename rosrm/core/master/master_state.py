@@ -529,9 +529,13 @@ class MasterState:
         return [name for name, image in images if image is not None and image.host == host.name]
 
     def owned_by(self, instance: Instance) -> Process | None:
-        """Return the process whose name this instance owns; None: it is not the owner."""
+        """Return the process whose name this instance owns; None: it is not the owner.
+
+        A stray owns no name, even if it was the owner until it was given up with its lost host.
+        """
         process = self.processes.get(instance.id.process)
-        return process if process and process.owner == instance.id.number else None
+        is_owner = process and process.owner == instance.id.number and not instance.stray
+        return process if is_owner else None
 
     # --- instances -----------------------------------------------------------------------
 

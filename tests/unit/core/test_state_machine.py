@@ -1150,3 +1150,17 @@ class Play(RuleBasedStateMachine):
 
 
 TestPlay = Play.TestCase
+
+
+def test_a_source_that_was_given_up_owns_no_name_after_its_move_is_undone() -> None:
+    """It returned with its host during the undo, and was being stopped: it is no owner any more."""
+    play = Play()
+    play.begin(
+        backfill=False, most=1, slots=0, first="handoff, standby", second="handoff, standby",
+        loss="wait", preemption="move", rebalance=False, devices="",
+    )  # fmt: skip
+    for which in (3, 0):
+        play.hosts_of_a_successor_are_lost(which=which)
+        play.all_is_well()
+        play.the_state_is_sound()
+    play.teardown()

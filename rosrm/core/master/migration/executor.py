@@ -374,7 +374,7 @@ def _settle_owner(state: MasterState, process: Process, migration: Migration, no
     if process.image is not None and process.owner == 0:
         image_requests.settle(state, process, migration, now)
         return
-    if owner is None:
+    if owner is None or owner.stray:  # given up, and being stopped since its host is back
         host = migration.destination_host if migration.committed else migration.source_host
         lifecycle.conclude(state, process, _end_of_owner(process, migration), host, now)
         return
