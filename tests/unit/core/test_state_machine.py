@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
@@ -1149,7 +1150,7 @@ class Play(RuleBasedStateMachine):
         assert set(orders.expired(now + 3600.0)) == orders.pending.keys()
 
 
-TestPlay = Play.TestCase
+TestPlay = pytest.mark.timeout(300)(Play.TestCase)  # 60 s alone, more beside other work
 
 
 def test_a_source_that_was_given_up_owns_no_name_after_its_move_is_undone() -> None:
