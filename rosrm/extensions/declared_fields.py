@@ -7,13 +7,17 @@ fields by which demands are compared: the standard ones, and those that its offe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import cache
+from operator import is_
 from types import MappingProxyType
-from typing import Any, Final, cast
+from typing import Any, Final, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from rosrm.extensions.contracts import Capabilities
 from rosrm.model.values import EMPTY, ProcessSpec
 from rosrm.wording import listed
+
+T = TypeVar("T")
 
 #: Fields of a spec that every policy may read, because `Demand.key` includes them.
 STANDARD_FIELDS: Final = (
@@ -65,6 +69,47 @@ class DeclaredSpec:
 def declared_spec(spec: ProcessSpec, reads: tuple[str, ...]) -> ProcessSpec:
     """Return the view of a spec for a plugin that declares these fields."""
     return cast(ProcessSpec, DeclaredSpec(spec, reads))
+
+
+def unshared(value: T) -> T:
+    """Return a value of which a plugin may change every mapping and list, as they are copies."""
+    return cast(T, _unshared(value))
+
+
+def _unshared(value: Any) -> Any:
+    kind = type(value)
+    if kind is dict:
+        return {key: _unshared(item) for key, item in value.items()}
+    if kind is list:
+        return list(map(_unshared, value))
+    if kind is tuple:
+        made = tuple(map(_unshared, value))
+        return value if all(map(is_, made, value)) else made
+    if not is_dataclass(kind):
+        return value
+    changed = {}
+    for name in _changeable(kind):
+        item = getattr(value, name)
+        copied = _unshared(item)
+        if copied is not item:
+            changed[name] = copied
+    return replace(value, **changed) if changed else value
+
+
+@cache
+def _changeable(kind: Any) -> tuple[str, ...]:
+    """Return the names of the fields that hold a mapping or list, or a value with one."""
+    hints = get_type_hints(kind)
+    return tuple(one.name for one in fields(kind) if _may_change(hints[one.name]))
+
+
+def _may_change(hint: Any) -> bool:
+    origin = get_origin(hint) or hint
+    if origin is Any or (isinstance(origin, type) and issubclass(origin, Mapping | list)):
+        return True
+    if is_dataclass(origin):
+        return bool(_changeable(origin))
+    return any(map(_may_change, get_args(hint)))
 
 
 def no_options(_strategy: str, _spec: ProcessSpec) -> Any:

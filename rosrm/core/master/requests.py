@@ -37,7 +37,7 @@ from rosrm.core.master.state.process import WAITING, DesiredState, Process, Proc
 from rosrm.core.master.stores import check_number, check_store, make_room
 from rosrm.errors import PluginError, plain_text
 from rosrm.extensions.contracts import SpecChecking
-from rosrm.extensions.declared_fields import container_conflict, no_standby
+from rosrm.extensions.declared_fields import container_conflict, no_standby, unshared
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.adoption_rules import adoption_fault
 from rosrm.model.event_kinds import EventKind
@@ -273,7 +273,7 @@ def _strategy_fault(state: MasterState, spec: ProcessSpec) -> str:
             return plain_text(str(fault), lines=True)
         if not implements(strategy, SpecChecking):
             return ""
-        return required(strategy.spec_fault(spec), str)
+        return required(strategy.spec_fault(unshared(spec)), str)
 
     try:
         return state.plugins.ask("migration", name, "spec_fault", fault_of, strategy)

@@ -659,6 +659,23 @@ def test_a_plan_of_a_class_of_the_plugin_is_journalled_as_a_plan() -> None:
     assert {type(one.plan) for one in cluster.state.migrations.values()} == {Plan}
 
 
+def test_a_strategy_changes_its_own_copy_of_the_spec() -> None:
+    """The master keeps and journals the spec, by which the process starts again."""
+
+    def changing(move: Move) -> Plan:
+        move.spec.environment["A"] = "2"  # type: ignore[index]
+        move.spec.migration.options["odd"] = 1  # type: ignore[index]
+        return StartFirstOrStopFirst().propose(move)
+
+    cluster = moving_by(changing)
+    policy = MigrationPolicy("strange", options={"mine": 1})
+    cluster.submit(process("q", environment={"A": "1"}, migration=policy))
+    cluster.wait(2.0)
+    assert cluster.migrate("q").accepted
+    known = cluster["q"].spec
+    assert (known.environment, known.migration.options) == ({"A": "1"}, {"mine": 1})
+
+
 def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
     """Started instances that do not own the name are stopped before anything else is started."""
 

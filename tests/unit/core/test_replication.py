@@ -194,6 +194,25 @@ def test_a_choice_of_similar_types_is_ordered_in_the_declared_ones():
     assert (type(order.every), order.every) == (float, 2.5)
 
 
+def test_a_policy_changes_neither_the_spec_nor_the_labels_of_hosts():
+    """Otherwise the next start would have another environment, and hosts other labels."""
+
+    class Changing(Asked):
+        def choose(self, process):
+            process.spec.environment["A"] = "2"
+            process.spec.parameters["list"].append(3)
+            for labels in process.hosts.values():
+                labels["rack"] = "odd"
+
+    spec = stateful(environment={"A": "1"}, parameters={"list": [1]})
+    cluster = running(Changing(), "a", "b", spec=spec)
+    cluster.wait(5.0)
+    (failure,) = cluster.recorded("plugin_failed")
+    assert "does not support item assignment" in failure
+    known = cluster["p"].spec
+    assert (known.environment, known.parameters) == ({"A": "1"}, {"list": [1]})
+
+
 def test_a_choice_of_endless_hosts_costs_one_call():
     """No alarm ends the loop in C that would make a tuple of them."""
     policy = Asked()

@@ -30,6 +30,7 @@ from rosrm.core.master.state.periodic import Dumped
 from rosrm.core.master.state.process import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
+from rosrm.extensions.declared_fields import unshared
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
@@ -153,11 +154,11 @@ def _pace(
     try:
         asked = state.plugins.ask(
             "migration", asked_of, "checkpoint_every",
-            lambda: float(strategy.checkpoint_every(process.spec)), strategy,
+            lambda: float(strategy.checkpoint_every(unshared(process.spec))), strategy,
         )  # fmt: skip
         if not asked > 0.0:
             return None
-        view = MemoryView(process.spec, host.name, asked, dumped.size, dumped.pause)
+        view = MemoryView(unshared(process.spec), host.name, asked, dumped.size, dumped.pause)
         asked_of = name
         return state.plugins.ask(
             "checkpoint", name, "pace", lambda: sound_pace(pacing.pace(view)), pacing
@@ -183,7 +184,7 @@ def _order(
     spec, host = process.spec, owner.host.name
 
     def ask() -> Execute:
-        step = required(strategy.periodic(spec, owner.id, host, int(state.wall)), Execute)
+        step = required(strategy.periodic(unshared(spec), owner.id, host, int(state.wall)), Execute)
         return checked(step, Execute, "step")
 
     try:

@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import islice
+from types import MappingProxyType
 from typing import Final
 
 from rosrm.core.master import events as happened
@@ -40,6 +41,7 @@ from rosrm.core.master.state.replicas import Replica, ReplicationOrder
 from rosrm.errors import PluginError
 from rosrm.extensions.answers import exact
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointView
+from rosrm.extensions.declared_fields import unshared
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import DropReplica, ReplicateSnapshot
@@ -238,13 +240,13 @@ def _choice(
     current = state.replication.replicas.hosts_of(process.name, process.born)
     others = tuple(name for name in current if name != host.name)
     hosts = {
-        one.name: one.description.labels
+        one.name: MappingProxyType(one.description.labels)
         for one in state.hosts.hosts
         if _may_hold_replica(state, one, others)
     }
     since = max((replicas[name].since for name in others), default=None)
     view = CheckpointView(
-        process.spec, host.name, None if since is None else now - since,
+        unshared(process.spec), host.name, None if since is None else now - since,
         _newest_size(replicas), others, hosts,
     )  # fmt: skip
     try:

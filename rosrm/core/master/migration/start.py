@@ -15,6 +15,7 @@ from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.errors import PluginError, describe_fault
+from rosrm.extensions.declared_fields import unshared
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
@@ -230,7 +231,7 @@ def proposed(state: MasterState, name: str, move: Move, aim: Aim = Aim.MOVE) -> 
     def ask() -> Plan | Rejected:
         try:
             given = replace(
-                move, options=state.declared.options_of(name, move.spec),
+                unshared(move), options=state.declared.options_of(name, move.spec),
                 lacking=_lacking_executors(state, name, move),
             )  # fmt: skip
             plan = required(getattr(state.strategies[name], _HOOKS[aim])(given), Plan)
