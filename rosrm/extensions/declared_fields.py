@@ -107,7 +107,7 @@ def _may_change(hint: Any) -> bool:
     origin = get_origin(hint) or hint
     if origin is Any or (isinstance(origin, type) and issubclass(origin, Mapping | list)):
         return True
-    if is_dataclass(origin):
+    if isinstance(origin, type) and is_dataclass(origin):
         return bool(_changeable(origin))
     return any(map(_may_change, get_args(hint)))
 

@@ -165,8 +165,7 @@ class SlaveRuntime:
             self._launchers = tuple(launchers.made)
             sessions = SessionTable(launchers=launchers)
             self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
-            self._absent = self._open_probes(registry, sessions, opened)
-            first = self._sampler.first().reports
+            self._absent, first = self._open_probes(registry, sessions, opened)
             self._devices = DeviceWatch(config.devices)
             self._devices.look(self._sampler.devices)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
@@ -210,8 +209,8 @@ class SlaveRuntime:
 
     def _open_probes(
         self, registry: Registry, sessions: SessionTable, opened: contextlib.ExitStack
-    ) -> Mapping[str, str]:
-        """Start reading the probes; return the absent ones with the reasons."""
+    ) -> tuple[Mapping[str, str], tuple[ProbeReport, ...]]:
+        """Read the probes once; return the absent ones with the reasons, and the reports."""
         config = self._config
         self._process = ProcessState()  # before the first read, which may change it
         context = ProbeContext(config.scope, config.budget, config.state, sessions)
@@ -220,10 +219,11 @@ class SlaveRuntime:
         opened.callback(self._sampler.close)
         self._probe_labels = probes.labels
         self._limit = self._limits()
-        return probes.absent
+        first = self._sampler.first().reports
+        self._process.restore()  # before the supervisor and the processes get the environment
+        return probes.absent, first
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
-        self._process.restore()  # each process gets the environment, and so does the supervisor
         self._supervisor = SupervisorLink(
             self._config.state / "supervisor", self._config.logs, post=self._post, take=self._take,
             follow=self._follow_session,
