@@ -94,6 +94,7 @@ class Probe:
         act()
         return [Reading(self.name, 0.5)]
     def close(self): pass
+def sets_environment(): os.environ["CUDA_VISIBLE_DEVICES"] = "of the probe"
 def joins_ros():
     import rclpy
     rclpy.init()
@@ -111,7 +112,7 @@ def takes_signals():
     os.chdir("/"); os.umask(0)
 PROBES = {
     "joins_ros": joins_ros, "leaves_threads": leaves_threads, "leaves_fork": leaves_fork,
-    "takes_signals": takes_signals,
+    "takes_signals": takes_signals, "sets_environment": sets_environment,
 }
 @hookimpl
 def register_probes():
@@ -263,6 +264,14 @@ def test_a_slave_with_such_a_probe_ends_in_order(make_cluster: Make, probe: str)
     wait_until(lambda: not alive(pid), "the process ends")
     assert "Traceback" not in cluster.log_of("h0")
     assert "slave of h0 ended" in cluster.log_of("h0")
+
+
+def test_the_environment_of_a_plugin_reaches_no_process(make_cluster: Make) -> None:
+    """Neither the supervisor nor a process of another owner gets a variable of a probe."""
+    cluster = _with_probe(make_cluster, "sets_environment")
+    variables = Path(f"/proc/{cluster.process('innocent').pid}/environ").read_bytes()
+    assert b"ROSRM_PROCESS=innocent" in variables
+    assert b"CUDA_VISIBLE_DEVICES" not in variables
 
 
 def test_a_fork_of_a_plugin_holds_no_lock(make_cluster: Make) -> None:
