@@ -1,6 +1,7 @@
 """Signals to other processes, which may have ended or may belong to another user.
 
-Each function returns why the signal was refused; "": it was sent, or the process has ended.
+Each function returns why the signal was refused; "": it was sent, or the process has ended. A pid
+that is not known may read as 0 or -1, and the system would signal a whole group, or all processes.
 """
 
 # ruff: noqa: TID251 - the one module that sends signals
@@ -14,12 +15,12 @@ from collections.abc import Callable
 
 def send(pid: int, number: int) -> str:
     """Send a signal to a process."""
-    return _sent(os.kill, pid, number)
+    return _sent(os.kill, pid, number) if pid > 0 else f"{pid} is no pid"
 
 
 def send_to_group(leader: int, number: int) -> str:
     """Send a signal to a process group."""
-    return _sent(os.killpg, leader, number)
+    return _sent(os.killpg, leader, number) if leader > 0 else f"{leader} is no process group"
 
 
 def send_by(pidfd: int, number: int) -> str:

@@ -6,6 +6,8 @@ import os
 import signal
 import subprocess
 
+import pytest
+
 from rosrm.runtime.signalling import send, send_by, send_to_group
 
 
@@ -29,3 +31,14 @@ def test_a_refusal_is_returned_with_its_reason(monkeypatch):
 
     monkeypatch.setattr(os, "kill", refuse)
     assert send(1, signal.SIGTERM) == "Operation not permitted"
+
+
+@pytest.mark.parametrize("pid", [0, -1])
+def test_an_unknown_pid_reaches_no_other_process(monkeypatch, pid):
+    """The system would signal the sender's group, or all processes."""
+    sent: list[int] = []
+    for name in ("kill", "killpg"):
+        monkeypatch.setattr(os, name, lambda target, _: sent.append(target))
+    assert "no pid" in send(pid, signal.SIGKILL)
+    assert "no process group" in send_to_group(pid, signal.SIGKILL)
+    assert sent == []
