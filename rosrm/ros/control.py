@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 #: Ids of one sender that are remembered at least, for late repetitions, and at most. An id is never
 #: forgotten while a copy of its request is young enough to be admitted.
-_REMEMBERED: Final = 10_000
+_REMEMBERED: Final = 1_000
 _MOST_REMEMBERED: Final = 50_000
 #: The same for long polls: a late repetition of one has no use, and a thousand slaves send polls.
 _REMEMBERED_POLLS: Final = 16

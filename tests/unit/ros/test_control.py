@@ -136,7 +136,7 @@ def test_an_old_id_is_remembered_while_there_is_room() -> None:
     judge = RequestGate(clock, 5.0)
     assert admit(judge, envelope(100 * S))
     clock.now += 60.0
-    flood(judge, 9_998, 160 * S)
+    flood(judge, control._REMEMBERED - 2, 160 * S)
     assert judge.knows(envelope(100 * S))
 
 
@@ -150,7 +150,7 @@ def test_the_memory_of_the_gate_is_bounded() -> None:
     clock.now += 5.1
     assert judge.refusal(envelope(105 * S, request_id="one more")) is None
     assert not judge._answers.keys() ^ judge._admitted.keys()
-    assert len(judge._answers) < 10_000
+    assert len(judge._answers) < control._REMEMBERED
 
 
 def test_the_repetitions_that_wait_are_bounded() -> None:
