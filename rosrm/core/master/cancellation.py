@@ -28,6 +28,9 @@ def cancel(
     process.wanted, process.overdue, process.cancel_cause = DesiredState.CANCEL, False, cause
     state.clear_left_behind(process)
     state.gangs.leave(process)
+    application = state.applications.get(process.spec.application)
+    if application is not None and application.note_cancelled(process.name):
+        state.save_application(application)
     message = f"a cancellation of {process.name} was requested"
     if cause:
         message = f"{process.name} is cancelled: {cause}"

@@ -496,6 +496,40 @@ def test_a_user_may_cancel_a_process_while_it_is_replaced() -> None:
     assert state_of(cluster) == (2, [])
 
 
+
+@pytest.mark.parametrize("stubborn", [True, False])
+def test_a_process_that_was_cancelled_in_the_work_starts_on_the_next_request(
+    stubborn: bool,
+) -> None:
+    """The reply says so, whether its former instance has ended yet or not."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"))
+    cluster.wait(1.0)
+    cluster.apply("nav", new(process("p")), healthy_for=10.0)
+    cluster.wait(2.0)
+    cluster.machines["a"].stubborn |= {"p"} if stubborn else set()
+    cluster.cancel("p")
+    again = cluster.apply("nav", new(process("p")), healthy_for=10.0)
+    if stubborn:
+        cluster.let_go("p")
+    cluster.wait(15.0)
+    assert actions(again) == {"p": "start"}
+    assert (program(cluster, "p"), state_of(cluster)) == (("new",), (2, []))
+
+
+def test_a_process_that_is_cancelled_before_its_replacement_does_not_start_again() -> None:
+    """The cancellation is newer than the request whose work on the process has not begun."""
+    cluster = Cluster("a")
+    parts = [process("p"), process("q")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    cluster.apply("nav", *map(new, parts), healthy_for=5.0, max_parallel=1)
+    cluster.wait(1.0)
+    cluster.cancel("q")
+    cluster.wait(10.0)
+    assert (cluster.phase("q"), state_of(cluster)) == ("cancelled", (2, []))
+
+
 # --- failures ---------------------------------------------------------------------------------
 
 
@@ -521,6 +555,20 @@ def test_a_version_that_fails_is_given_up() -> None:
     assert again.message.endswith(warning)
     reverted = cluster.apply("nav", version=2)
     assert reverted.message.endswith(warning)
+
+
+def test_a_return_starts_no_process_that_was_cancelled_since() -> None:
+    """It starts one that the failed version did not have."""
+    cluster = Cluster("a")
+    cluster.apply("nav", process("p"), process("q"), process("r"))
+    cluster.wait(1.0)
+    cluster.apply("nav", new(process("p")), process("q"), healthy_for=5.0)
+    cluster.wait(2.0)
+    cluster.cancel("q")
+    cluster.finish("p", code=1)
+    cluster.wait(10.0)
+    assert [cluster.phase(name) for name in "pqr"] == ["running", "cancelled", "running"]
+    assert state_of(cluster) == (1, [])
 
 
 @pytest.mark.parametrize("other", ["a single process", "another user's"])

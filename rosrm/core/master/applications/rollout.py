@@ -22,8 +22,9 @@ process that runs with another version is replaced later; the wait doubles with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import replace
+from functools import partial
 from math import inf
 from typing import Final
 
@@ -318,14 +319,29 @@ def _handle_fault(
         message = f"returns from version {version.number} to {application.former}: {why}"
         _note(state, application, now, EventKind.APPLICATION_RETURNS, message)
         state.save_version(application, replace(version, given_up=why))
-        _set_wanted(state, application, application.former, now, former=0)
+        cancelled = frozenset(filter(partial(_stays_cancelled, state, application), version.specs))
+        _set_wanted(
+            state, application, application.former, now, former=0, stay_cancelled=cancelled
+        )
+
+
+def _is_cancelled(state: MasterState, name: str) -> bool:
+    """Return True if a process has been cancelled, or is being cancelled."""
+    process = state.processes.get(name)
+    return process is not None and process.wanted is DesiredState.CANCEL
+
+
+def _stays_cancelled(state: MasterState, application: Application, name: str) -> bool:
+    """Return True if a process was cancelled after the newest request to start it."""
+    task = application.tasks.get(name)
+    return _is_cancelled(state, name) and (task is None or task.begun)
 
 
 def want(state: MasterState, application: Application, number: int, now: float) -> None:
     """Make a version the desired one on request, and begin the work on it; 0: no version.
 
     Unfinished work continues if the same version is requested again; otherwise only on processes
-    that the new version does not change.
+    that the new version does not change. A process that was cancelled since starts again.
     """
     same = number == application.wanted
     # The version before may be one that was not reached yet.
@@ -336,13 +352,14 @@ def want(state: MasterState, application: Application, number: int, now: float) 
 
 def _set_wanted(
     state: MasterState, application: Application, number: int, now: float, *, former: int,
-    tasks: Mapping[str, Task] = EMPTY,
+    tasks: Mapping[str, Task] = EMPTY, stay_cancelled: Set[str] = frozenset(),
 ) -> None:  # fmt: skip
     """Begin the work on a version.
 
     Args:
         former: number of the version to which a failure leads back; 0: none.
         tasks: unfinished work; it continues where the version is the same or changes nothing.
+        stay_cancelled: names of processes that are not started.
     """
     same = number == application.wanted
     application.returning = bool(application.former and not former and number)
@@ -350,6 +367,7 @@ def _set_wanted(
     application.behind.clear()
     names = state.names_of(application.name)
     found = differences(state, application.name, application.specs, names)
+    found = {name: one for name, one in found.items() if name not in stay_cancelled}
     ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]
     order = dict.fromkeys([one.name for one in dependants_first(state, ending)]) | found
     begun = {name: Task(replaces=found[name].action is Action.REPLACE) for name in order}
@@ -362,7 +380,10 @@ def _set_wanted(
     }  # fmt: skip
     unchanged = application.specs.keys() - found.keys()
     live = {name for name in unchanged if not state.processes[name].phase.is_terminal}
-    unfinished = {name: task for name, task in tasks.items() if same or name in live}
+    unfinished = {
+        name: task for name, task in tasks.items()
+        if (same or name in live) and not (name in found and _is_cancelled(state, name))
+    }  # fmt: skip
     application.tasks = {**open_yet, **begun, **unfinished}
     state.save_application(application)
     _review(state, application, now)

@@ -43,7 +43,7 @@ class Task:
 
     Attributes:
         replaces: a live process is replaced; few are at the same time.
-        begun: the action on the process has begun.
+        begun: the action on the process has begun, or the process was cancelled before.
         fault: why its replacement failed; "": it did not.
         reason: why it is not done yet.
         run: number of the owning instance and its restarts when the process began to run well.
@@ -108,6 +108,17 @@ class Application:
         """Return the number of the version to which a failure of another one would lead back."""
         unreached = bool(self.tasks) and not self.returning
         return self.former if unreached else self.wanted
+
+    def note_cancelled(self, name: str) -> bool:
+        """Note that a process is cancelled before the action on it; return True if that is news.
+
+        The cancellation is newer than the request, so the process does not start again.
+        """
+        task = self.tasks.get(name)
+        if task is None or task.begun:
+            return False
+        task.begun = True
+        return True
 
     def reopen(self, name: str) -> None:
         """Note that a process runs with another spec than the desired one, and is replaced.
