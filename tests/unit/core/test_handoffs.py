@@ -108,6 +108,22 @@ def test_a_handoff_without_faults_publishes_each_phase_once() -> None:
     assert cluster["p"].migrations == 1
 
 
+def test_a_step_is_done_although_its_order_was_repeated_before_the_answer() -> None:
+    """On a link whose answers take longer than `order_retry`, the newest order has none yet."""
+    cluster = two_hosts(order_retry=2.0)
+    late: list[tuple[float, happened.OrderAnswered]] = []
+    for machine in cluster.machines.values():
+        machine.obey = lambda sent, now, obey=machine.obey: (  # type: ignore[method-assign]
+            late.append((now + 3.0, obey(sent, now))) or happened.OrderAnswered(0, accepted=True)
+        )
+    cluster.migrate("p", "b")
+    for _ in range(200):
+        cluster.wait(0.1)
+        while late and late[0][0] <= cluster.now:
+            cluster.tell(late.pop(0)[1])
+    has_moved(cluster)
+
+
 def test_a_shadow_without_a_reply_is_repeated_until_the_next_step_is_done() -> None:
     """A node of the paper may join when newer messages about other handoffs replaced the first."""
     state = {"protocol": "paper", "state": "/state", "type": "std_msgs/msg/Int64"}

@@ -67,6 +67,7 @@ def begin(state: MasterState, migration: Migration, step: Step, now: float) -> b
     if now < migration.retry.until or _is_expected(state, migration, step):
         return False
     migration.begun, migration.answer = True, None
+    migration.orders.clear()
     migration.deadline = now + _time_limit(state, migration, step)
     _give_order(state, migration, step, now)
     return True
@@ -111,13 +112,16 @@ def outcome_of(state: MasterState, migration: Migration, step: Step, now: float)
 
 
 def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
-    """Note the answer to the order of the current step of a migration.
+    """Note the answer to an order of the current step of a migration.
+
+    An answer counts although the order was repeated since: else no step would be done on a link
+    whose answers take longer than `order_retry`.
 
     The results of executors are arguments of later ones. The answer to the start of a standby is
     ignored, because that order is repeated anyway.
     """
     migration = state.migrations.get(process)
-    if migration is None or migration.order != event.order:
+    if migration is None or event.order not in migration.orders:
         return
     if event.outcome is OrderOutcome.TIMEOUT:
         return
@@ -132,7 +136,6 @@ def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
 
 def _give_order(state: MasterState, migration: Migration, step: Step, now: float) -> None:
     """Send the order of a step to its slave, or publish the phase of a handoff to its nodes."""
-    migration.order = None
     if isinstance(step, Commit | AwaitReady | AwaitReleased):
         return
     if isinstance(step, Configure):
@@ -143,7 +146,8 @@ def _give_order(state: MasterState, migration: Migration, step: Step, now: float
         return
     host = state.hosts.by_name[step.host]
     order, purpose = _order_of(state, migration, step, now), MigrationStep(migration.process)
-    migration.order, migration.order_at = state.send(host, order, purpose), now
+    migration.orders.add(state.send(host, order, purpose))
+    migration.order_at = now
 
 
 def _order_of(

@@ -64,7 +64,7 @@ class Migration:
         committed: the destination owns the name.
         deadline: time at which the current step times out.
         begun: the current step has been ordered.
-        order: order of the current step; None: the step has none.
+        orders: orders of the current step since it was begun; the step may have none.
         stuck: a step that must succeed failed; it is retried with a back-off.
         answer: the slave's answer to the order of the current step; None: no answer yet.
         launched: numbers of the instances that were ordered to start.
@@ -104,7 +104,7 @@ class Migration:
     committed: bool = False
     begun: bool = False
     deadline: float = 0.0
-    order: OrderId | None = None
+    orders: set[OrderId] = field(default_factory=set)
     order_at: float = 0.0
     failure: str = ""
     stuck: bool = False
