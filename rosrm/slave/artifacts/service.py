@@ -92,6 +92,7 @@ class ArtifactService:
         }  # fmt: skip
         for digest in [digest for digest in self._fetches if digest not in wanted]:
             self._fetches.pop(digest).cancel()
+        self._begin_fetches()  # of others, which waited for one of these to end
 
     def tick(self, now: float) -> None:
         """Continue all fetches, and report their progress; called several times a second."""

@@ -264,6 +264,19 @@ def test_a_stopped_instance_cancels_its_fetch(host, offered, tmp_path):
     assert first not in host.ended
 
 
+def test_a_stopped_instance_lets_others_fetch(host, offered):
+    """Its fetches took all places, so that the other one had to wait."""
+    host.master.is_silent = True
+    stopped = host.prepare(1, offered("one"), offered("two"))
+    host.run_until(lambda: len(host.master.asked) >= 2, "both are fetched")
+    waiting = host.prepare(2, offered("three"))
+    searched = host.service._preparing[waiting]
+    host.run_until(lambda: searched.missing is not None, "the cache was searched")
+    host.service.forget(stopped)
+    host.master.is_silent = False
+    assert host.outcome(waiting) == ""
+
+
 def test_a_later_run_of_the_slave_knows_the_artifacts_in_use():
     """The supervisor keeps them with the instance."""
     memo = Memo(artifacts=(Artifact("x", "0" * 64, 5),))
