@@ -107,7 +107,7 @@ def _may_be_unwell(state: MasterState, process: Process, silent: set[str]) -> bo
     """Return False for most processes that are well; a row of each would take too long."""
     if process.phase in _UNWELL_PHASES:
         return True
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     return owner is not None and (owner.host.name in silent or "limits.memory" in owner.enforced)
 
 

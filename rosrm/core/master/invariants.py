@@ -185,10 +185,10 @@ def instances(state: MasterState) -> Iterator[str]:
 def specs(state: MasterState) -> Iterator[str]:
     """Each instance has the spec with which it runs; the owner has that of its process."""
     for name, process in state.processes.items():
-        spec, owner = process.spec, state.instances.get(process.owner)
+        spec, owner = process.spec, state.owner_of(process)
         if spec.name != name:
             yield f"{name} has the spec of {spec.name}"
-        if owner is not None and owner.spec != spec and not owner.stray:
+        if owner is not None and owner.spec != spec:
             yield f"{owner.id} owns {name}, but has another spec"
         if process.next_spec is not None and not process.instances:
             yield f"{name} has a next spec, and no instance that ends before"

@@ -93,7 +93,7 @@ def process_rows(state: MasterState, now: float) -> list[ProcessRow]:
 
 def process_row(state: MasterState, process: Process, now: float) -> ProcessRow:
     """Return the row of one process."""
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     seen = owner.seen if owner else {}
     silence = _silence(state, owner, now)
     phase, since = process.phase.value, now - process.since
@@ -249,7 +249,7 @@ def _limits(state: MasterState, process: Process) -> Mapping[str, Any]:
     the program: also this usage.
     """
     earlier = state.learned.estimate(process.spec, {}).amounts
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     runs = owner is not None and owner.is_running
     found: dict[str, Any] = {}
     for name, value in limits_in_words(process.spec).items():
@@ -291,7 +291,7 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
     made = state.preemption.room_made.get(process.name) if position else None
     room = made.reason if made is not None else ""
     if position <= 1 or room or state.queue.head() == process.name:
-        owner = state.instances.get(process.owner)
+        owner = state.owner_of(process)
         reason = _reason_of_phase(state, process) or _missing_standby(state, process)
         reason = reason or _awaited_node(process, owner)
         return f"{reason}; {room}" if room and room != reason else reason
@@ -301,7 +301,7 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
 
 def _advice(state: MasterState, process: Process) -> str:
     """Return the commands that a user may run next; "" for none."""
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if owner is not None and state.hosts.condition_of(owner.host) in _OUT_OF_REACH:
         return f"start the slave of {owner.host.name} again"
     logs = f"`rosrm logs {process.name}` shows its output"

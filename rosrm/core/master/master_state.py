@@ -537,6 +537,11 @@ class MasterState:
         is_owner = process and process.owner == instance.id.number and not instance.stray
         return process if is_owner else None
 
+    def owner_of(self, process: Process) -> Instance | None:
+        """Return the instance that owns the name of a process; None: none that is no stray."""
+        owner = self.instances.get(process.owner)
+        return None if owner is None or owner.stray else owner
+
     # --- instances -----------------------------------------------------------------------
 
     def new_instance_id(self, process: Process) -> InstanceId:

@@ -326,7 +326,7 @@ def _cancelled(state: MasterState, processes: Iterable[Process], terminal: list[
     phrases += [
         f"{process.name} is {process.reason}"
         for process in pending
-        if (owner := state.instances.get(process.owner)) is not None
+        if (owner := state.owner_of(process)) is not None
         and state.hosts.why_unreachable(owner.host)
     ]
     if terminal:

@@ -133,7 +133,7 @@ def _obstacle(state: MasterState, name: str) -> str:
 
 def _review_restart(state: MasterState, process: Process, now: float) -> None:
     """Restart a process in place, unless it does not run or a condition does not hold."""
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if owner is None or owner.restarting or process.phase not in _RESTARTABLE:
         return
     if owner.state not in _STARTED:
@@ -155,7 +155,7 @@ def _review_restart(state: MasterState, process: Process, now: float) -> None:
 
 def _review_stop(state: MasterState, process: Process, now: float) -> None:
     """Stop a cancelled process if its dependants have ended; else begin its time-out again."""
-    orders, owner = state.start_orders, state.instances.get(process.owner)
+    orders, owner = state.start_orders, state.owner_of(process)
     if orders.last_to_stop[process.name] == inf:
         orders.last_to_stop[process.name] = now
     if owner is None or process.name in state.migrations:
@@ -174,7 +174,7 @@ def review_stops(state: MasterState, now: float) -> None:
         if not orders.last_to_stop.keys().isdisjoint(awaited):
             continue  # one of them waits in turn
         longest = max((state.processes[one].spec.stop.timeout for one in awaited), default=0.0)
-        owner = state.instances.get(process.owner)
+        owner = state.owner_of(process)
         if owner is None or now - since < longest + _PATIENCE or name in state.migrations:
             continue
         del orders.last_to_stop[name]

@@ -496,7 +496,6 @@ def test_a_user_may_cancel_a_process_while_it_is_replaced() -> None:
     assert state_of(cluster) == (2, [])
 
 
-
 @pytest.mark.parametrize("stubborn", [True, False])
 def test_a_process_that_was_cancelled_in_the_work_starts_on_the_next_request(
     stubborn: bool,

@@ -141,7 +141,7 @@ class Meter:
                 continue
             self._first = now
             self._arrivals[process.name] = now
-            owner = state.instances.get(process.owner)
+            owner = state.owner_of(process)
             if owner is not None:
                 self._placed[process.name] = [owner.host.name]
 

@@ -20,7 +20,7 @@ def review(state: MasterState, now: float) -> None:
     """Order the changes; repeat orders that were refused or have no answer."""
     for name, pending in list(state.unamended.items()):
         process = state.processes.get(name)
-        owner = state.instances.get(process.owner) if process is not None else None
+        owner = state.owner_of(process) if process is not None else None
         if process is None or owner is None:
             del state.unamended[name]  # its next instance starts with the new spec
         elif name not in state.migrations and _is_due(state, owner, pending, now):

@@ -99,7 +99,7 @@ def _needs_no_start(
     others = set(changed) - IN_PLACE
     if others != {"limits"}:
         return not others
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     return owner is not None and (
         desired.limits.enforce != "required"
         or owner.host.enforces(desired.enforcement, desired.cpus)

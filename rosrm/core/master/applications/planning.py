@@ -251,7 +251,7 @@ def _action(
 
 def _refusable(before: MasterState, old: Process | None, new: Process) -> str:
     """Return when the host refuses a change of the running instance; "": it does not."""
-    owner = before.instances.get(old.owner) if old is not None else None
+    owner = before.owner_of(old) if old is not None else None
     limit = new.spec.limits.memory
     if old is None or owner is None or new.owner != old.owner:
         return ""
@@ -280,7 +280,7 @@ def _task_reason(state: MasterState, process: Process) -> str:
 
 
 def _host_of(state: MasterState, process: Process | None) -> str:
-    owner = state.instances.get(process.owner) if process is not None else None
+    owner = state.owner_of(process) if process is not None else None
     return owner.host.name if owner is not None else ""
 
 

@@ -22,7 +22,8 @@ process that runs with another version is replaced later; the wait doubles with 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Set
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from functools import partial
 from math import inf
@@ -320,9 +321,7 @@ def _handle_fault(
         _note(state, application, now, EventKind.APPLICATION_RETURNS, message)
         state.save_version(application, replace(version, given_up=why))
         cancelled = frozenset(filter(partial(_stays_cancelled, state, application), version.specs))
-        _set_wanted(
-            state, application, application.former, now, former=0, stay_cancelled=cancelled
-        )
+        _set_wanted(state, application, application.former, now, former=0, stay_cancelled=cancelled)
 
 
 def _is_cancelled(state: MasterState, name: str) -> bool:
@@ -352,7 +351,7 @@ def want(state: MasterState, application: Application, number: int, now: float) 
 
 def _set_wanted(
     state: MasterState, application: Application, number: int, now: float, *, former: int,
-    tasks: Mapping[str, Task] = EMPTY, stay_cancelled: Set[str] = frozenset(),
+    tasks: Mapping[str, Task] = EMPTY, stay_cancelled: AbstractSet[str] = frozenset(),
 ) -> None:  # fmt: skip
     """Begin the work on a version.
 

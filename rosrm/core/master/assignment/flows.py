@@ -83,7 +83,7 @@ def joined(one: Traffic, other: Traffic) -> Traffic:
 def _host(state: MasterState, name: str) -> Host | None:
     """Return the host of a process, also while it moves; None: it has none."""
     process = state.processes.get(name)
-    owner = state.instances.get(process.owner) if process is not None else None
+    owner = state.owner_of(process) if process is not None else None
     return owner.host if owner is not None else None
 
 

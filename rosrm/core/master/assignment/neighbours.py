@@ -102,7 +102,7 @@ def host_of(state: MasterState, name: str) -> tuple[Host | None, str]:
     process = state.processes.get(name)
     if process is None:
         return None, "does not exist"
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if name in state.migrations or owner is None:
         return None, standing(process.phase.value)
     if process.wanted is not DesiredState.RUN:

@@ -92,7 +92,7 @@ def of_process(state: MasterState, process: Process, now: float) -> Mapping[str,
 def _review(state: MasterState, process: Process, now: float) -> None:
     name = process.spec.migration.strategy or ""
     strategy: object = state.strategies.get(name)
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if owner is None or not implements(strategy, PeriodicImaging):
         return
     number, host = process.owner, owner.host

@@ -170,7 +170,7 @@ def _drop_removed(state: MasterState, name: str, now: float) -> None:
 
 def _review(state: MasterState, process: Process, now: float) -> None:
     replicas = state.replication.replicas.of(process.name)
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if owner is not None and owner.is_running and process.phase is ProcessPhase.RUNNING:
         _choose(state, process, owner.host, replicas, now)
     for name, replica in replicas.items():
@@ -298,7 +298,7 @@ def _is_stale(
     """Return True if, as far as the master knows, no instance will start from a replica."""
     if replica.number < process.born or process.phase in _DONE:
         return True
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if owner is None or process.phase is not ProcessPhase.RUNNING or host == owner.host.name:
         return False
     last = state.replication.last_orders.get(process.name)

@@ -102,7 +102,7 @@ def _learn(
     """Store what the processes of a host receive from others."""
     received = _received(state, host, flows) if flows else {}
     for name in {**received, **state.flows.learned}:
-        owner = state.instances.get(state.processes[name].owner)
+        owner = state.owner_of(state.processes[name])
         if owner is not None and owner.host is host:
             state.flows.learn(name, received.get(name, EMPTY), now, owner.since)
 
@@ -129,7 +129,7 @@ def _process_of_node(state: MasterState) -> dict[str, str]:
     """Return the process of each node that the processes with an owner bring into the graph."""
     nodes = {}
     for process in state.processes.values():
-        owner = state.instances.get(process.owner)
+        owner = state.owner_of(process)
         name = "" if owner is None else owner.node_name or process.spec.node
         if name and process.spec.ros:
             nodes[qualified_name(process.spec.namespace, name)] = process.name

@@ -370,11 +370,11 @@ def _note_not_replaced(state: MasterState, process: Process, migration: Migratio
 
 
 def _settle_owner(state: MasterState, process: Process, migration: Migration, now: float) -> None:
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if process.image is not None and process.owner == 0:
         image_requests.settle(state, process, migration, now)
         return
-    if owner is None or owner.stray:  # given up, and being stopped since its host is back
+    if owner is None:
         host = migration.destination_host if migration.committed else migration.source_host
         lifecycle.conclude(state, process, _end_of_owner(process, migration), host, now)
         return

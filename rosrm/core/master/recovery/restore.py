@@ -186,7 +186,7 @@ def _has_run(state: MasterState, process: Process, now: float) -> bool:
 
 
 def _expect_to_run(state: MasterState, process: Process, now: float) -> None:
-    owner = state.instances.get(process.owner)
+    owner = state.owner_of(process)
     if owner is not None:
         note_phase(state, process, owner, now)
     elif process.instances:
