@@ -497,6 +497,24 @@ def test_the_mode_in_force_cannot_be_removed() -> None:
     assert list(cluster.intents["mode"]) == ["exploring"]
 
 
+def test_modes_that_are_loaded_in_a_switch_do_not_end_it() -> None:
+    """The applications stay as they are; the next request for the mode applies the new one."""
+    waits = process("charger", start_order=StartOrder({"check": "finished"}))
+    docked = Mode("docked", (NAV, target("dock", waits, job("check"))))
+    cluster = in_mode("exploring", EXPLORING, docked)
+    switch(cluster, "docked", 1.0)
+    more = target("lights", process("lamp"))
+    assert load(cluster, EXPLORING, replace(docked, targets=(*docked.targets, more))).accepted
+    cluster.wait(1.0)
+    assert states(cluster)["docked"] == "switching"
+    cluster.finish("check", on=cluster.where("check")[0])
+    cluster.wait(3.0)
+    assert running(cluster) == {"planner", "driver", "charger"}
+    assert states(cluster)["docked"] == "in force"
+    switch(cluster, "docked")
+    assert "lamp" in running(cluster)
+
+
 def test_modes_survive_a_restart_of_the_master() -> None:
     """In the order of their file."""
     cluster = in_mode("exploring", EXPLORING, replace(DOCKED, when=Trigger(over_limit="cpu")))

@@ -181,8 +181,10 @@ def _faults(state: MasterState, mode: Mode, now: float) -> Iterator[str]:
     for name in mode.applications:
         application = state.applications.get(name)
         number = state.modes.versions.get(name)
+        if number is None:
+            continue  # the modes were loaded since the switch began
         if application is None or application.wanted != number:
-            version = application.versions.get(number or 0) if application is not None else None
+            version = application.versions.get(number) if application is not None else None
             yield version.given_up if version and version.given_up else f"{name} was changed since"
             continue
         if application.paused:
