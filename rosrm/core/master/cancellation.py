@@ -29,7 +29,7 @@ def cancel(
     state.clear_left_behind(process)
     state.gangs.leave(process)
     application = state.applications.get(process.spec.application)
-    if application is not None and application.note_cancelled(process.name):
+    if not cause and application is not None and application.note_cancelled(process.name):
         state.save_application(application)
     message = f"a cancellation of {process.name} was requested"
     if cause:

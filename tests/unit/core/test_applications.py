@@ -17,6 +17,7 @@ from rosrm.model.orders import AmendInstance, StartInstance
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
     Amendment,
+    GroupMembership,
     InstanceState,
     InstanceStatus,
     Limits,
@@ -567,6 +568,22 @@ def test_a_return_starts_no_process_that_was_cancelled_since() -> None:
     cluster.finish("p", code=1)
     cluster.wait(10.0)
     assert [cluster.phase(name) for name in "pqr"] == ["running", "cancelled", "running"]
+    assert state_of(cluster) == (1, [])
+
+
+def test_a_return_starts_what_the_failed_version_has_ended() -> None:
+    """The failure of a process has cancelled its group, and a job has run for too long."""
+    cluster = Cluster("a")
+    group = GroupMembership("pair", "on-failure")
+    parts = [movable("p", group=group), process("q", group=group), job("r")]
+    cluster.apply("nav", *parts)
+    cluster.wait(1.0)
+    late = replace(new(parts[2]), time_limit=2.0)
+    cluster.apply("nav", new(parts[0]), parts[1], late, healthy_for=30.0, max_parallel=3)
+    cluster.wait(1.0)
+    cluster.finish("p", code=1)
+    cluster.wait(10.0)
+    assert [program(cluster, name) for name in "pqr"] == [("run", "it")] * 3
     assert state_of(cluster) == (1, [])
 
 

@@ -331,8 +331,10 @@ def _is_cancelled(state: MasterState, name: str) -> bool:
 
 
 def _stays_cancelled(state: MasterState, application: Application, name: str) -> bool:
-    """Return True if a process was cancelled after the newest request to start it."""
-    task = application.tasks.get(name)
+    """Return True if a client has cancelled a process after the newest request to start it."""
+    process, task = state.processes.get(name), application.tasks.get(name)
+    if process is None or process.overdue or process.cancel_cause:
+        return False
     return _is_cancelled(state, name) and (task is None or task.begun)
 
 
