@@ -6,7 +6,7 @@ master_state.py, state/   data and the rules that keep it consistent; invariants
 tick.py        periodic work
 requests.py    requests of clients; rights.py, quotas.py, stores.py, contradictions.py,
                process_defaults.py, pruning.py, graph_names.py, cancellation.py
-answers.py     answers of slaves to orders; reloading.py, restarts.py
+answers.py     answers of slaves to orders; executor_results.py, reloading.py, restarts.py
 garbage.py     removal of what has ended from memory and journal
 lifecycle.py   an instance from start to end; rescheduling.py, time_limits.py, schedules.py
 adoption.py    a process that runs before it is submitted

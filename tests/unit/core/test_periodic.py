@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
@@ -133,6 +134,26 @@ def test_the_first_checkpoint_is_recorded_and_explained():
     told = cluster.explain("p")["checkpoint"]
     assert (told["size"], told["trouble"]) == (5000, "")
     assert 0.0 <= told["elapsed"] <= 11.0
+
+
+@pytest.mark.parametrize(
+    "seconds",
+    [
+        {"dump": "x" * 900_000},
+        {"x" * 900_000: 1.0},
+        {str(n): 0.1 for n in range(50_000)},
+        ["x"] * 9,
+    ],
+    ids=["long text", "long name", "many", "list"],
+)
+def test_an_event_has_the_durations_of_an_executor_within_bounds(seconds):
+    """With a megabyte in each of some events, no listing of events would reach its reader."""
+    host = Host()
+    host.answer = {"size": 5000, "seconds": seconds}
+    cluster = running(Pacing(), host)
+    cluster.wait(12.0)
+    (event,) = [one for one in cluster.records if one.kind == "periodic_checkpoint"]
+    assert len(json.dumps(dict(event.facts))) < 5_000
 
 
 @pytest.mark.parametrize(

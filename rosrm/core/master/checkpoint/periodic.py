@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.executor_results import number_of, seconds_of
 from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import Rejected
@@ -44,8 +45,6 @@ _LOOK_EVERY: Final = 1.0
 _PATIENCE: Final = 30.0
 #: First and longest time, in seconds, after a failure.
 _WAITS: Final = (1.0, 600.0)
-#: Upper bound of numbers in results, because JSON may hold integers that no float can.
-_MOST: Final = 1e18
 
 
 def review(state: MasterState, now: float) -> None:
@@ -210,9 +209,9 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
         return
     dumped.backoff = Backoff()
     result = event.result or {}
-    dumped.size = int(_number(result.get("size")))
-    parts = result.get("seconds")
-    dumped.pause = sum(map(_number, parts.values())) if isinstance(parts, Mapping) else 0.0
+    dumped.size = int(number_of(result.get("size")))
+    parts = seconds_of(result)
+    dumped.pause = sum(parts.values())
     recorded = dumped.made and not dumped.trouble
     dumped.made, dumped.trouble = True, ""
     if not recorded:
@@ -221,13 +220,8 @@ def _note(state: MasterState, dumped: Dumped, event: happened.OrderAnswered, now
             f"the first periodic checkpoint of {dumped.process} is made ({size(dumped.size)}, "
             f"paused for {dumped.pause:.2f} s): a crash starts the process from the newest",
             process=dumped.process, host=dumped.host,
-            facts={"size": dumped.size, "seconds": parts or {}},
+            facts={"size": dumped.size, "seconds": parts},
         )  # fmt: skip
-
-
-def _number(value: Any) -> float:
-    """Return a number of an executor's result; 0.0 for anything else, NaN and infinity too."""
-    return float(value) if isinstance(value, int | float) and 0 <= value < _MOST else 0.0
 
 
 def _record_trouble(state: MasterState, dumped: Dumped, trouble: str, now: float) -> None:

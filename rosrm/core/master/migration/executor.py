@@ -29,6 +29,7 @@ from typing import Final
 from rosrm.core.master import lifecycle
 from rosrm.core.master.checkpoint import image_requests, images
 from rosrm.core.master.events import OrderOutcome
+from rosrm.core.master.executor_results import seconds_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration import blackout, failover, handoff
 from rosrm.core.master.migration.steps import begin, outcome_of, title
@@ -329,7 +330,9 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
         migration.source_host.over_since[name] = now  # first wait for the effect of this migration
     kind, message = image_requests.ending_of(migration)
     durations = {
-        name: result["seconds"] for name, result in migration.results.items() if "seconds" in result
+        name: seconds_of(result)
+        for name, result in migration.results.items()
+        if "seconds" in result
     }
     silent = blackout.seconds(migration)
     state.record(
