@@ -21,6 +21,7 @@ from rosrm.extensions.contracts import (
     Launch,
     ProcessTreeLauncher,
 )
+from rosrm.extensions.declared_fields import unshared
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import MadeLauncher, MadeLaunchers
 from rosrm.extensions.plugin_calls import PluginCalls, given, implements, required, titled
@@ -135,8 +136,8 @@ class Launchers:
             )
 
         def ask() -> Launch | None:
-            # A launcher may change its copy, and return it.
-            own = replace(launch, environment=dict(launch.environment))
+            # A launcher may change its copy, and return it; the slave keeps the assignment.
+            own = replace(unshared(launch), environment=dict(launch.environment))
             prepared = launcher.prepare(own)
             return None if prepared is None else _checked(launch, required(prepared, Launch))
 

@@ -151,6 +151,25 @@ def test_a_launch_that_is_changed_in_its_place_is_checked_as_any_other(variables
     assert own.environment == {}
 
 
+def test_a_launcher_cannot_change_the_assignment_of_the_slave():
+    """The slave reads it again, for the limits, the health and the end of the process."""
+
+    class Changing:
+        def prepare(self, launch):
+            launch.assignment.spec.environment["ODD"] = "1"
+            launch.assignment.spec.needs.clear()
+            return launch
+
+    spec = ProcessSpec(
+        "p", command=("x",), environment={"A": "1"}, needs={"cpu": 1.0},
+        migration=MigrationPolicy("ours"),
+    )  # fmt: skip
+    own = launch("ours")
+    own = replace(own, assignment=replace(own.assignment, spec=spec))
+    launchers(ours=Changing()).prepare(own)
+    assert (spec.environment, spec.needs) == ({"A": "1"}, {"cpu": 1.0})
+
+
 def test_a_prepared_launch_has_no_methods_of_the_plugin():
     """The slave compares and encodes its texts, and sends them to the supervisor."""
 
