@@ -123,7 +123,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
         finally:
             end_limit()
             interrupts.end()
-            changed = before.restore()
+            changed = contained(before.restore)  # what a plugin left may be of any type
             if changed and logging.getLogger().handlers:  # a command has no log
                 _say_changed(" ".join(filter(None, (whom, hook))), listed(changed))
     finally:

@@ -79,6 +79,8 @@ class Deadlines:
         began = clocks.awake_time()
         if account is not None and began < account.until:
             raise PluginError(account.text)
+        if threading.current_thread() is not threading.main_thread():  # it holds no loop
+            return in_process(titled(*plugin), "", call)
         late = partial(self._expired, plugin)
         try:
             guarded = partial(in_process, titled(*plugin), "", call, often=True)

@@ -17,8 +17,9 @@ import sys
 import threading
 import warnings
 
-# Without the conversion to enumerations, which takes most of the time of `signal.getsignal`.
+# Without the conversion to enumerations, which takes most of the time of `signal`.
 from _signal import getsignal  # type: ignore[import-not-found]
+from _signal import signal as install
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -32,6 +33,9 @@ _SIGNALS: Final = (
 _OF_LIBRARIES: Final = (signal.SIGINT, signal.SIGTERM)
 
 
+#: Contents of `os.environ`. A copy is one step, which no thread of a plugin can divide; a copy of
+#: `os.environ` itself fails with `KeyError` if a thread removes a variable meanwhile.
+_VARIABLES: Final[dict[bytes, bytes]] = vars(os.environb)["_data"]
 #: Most environment variables in a warning, and most letters of each.
 _NAMED: Final = 3
 _LONGEST_NAME: Final = 100
@@ -67,7 +71,7 @@ class ProcessState:
         """Take what rosrm has changed itself: handlers, environment, garbage collection."""
         self._handlers = [getsignal(number) for number in _SIGNALS]
         self._collects = gc.isenabled(), gc.get_threshold()
-        self._environment = dict(os.environb) if self._whole else {}
+        self._environment = _VARIABLES.copy() if self._whole else {}
 
     def restore(self) -> list[str]:
         """Restore what has changed since; return what it was. No effect in another thread."""
@@ -75,9 +79,9 @@ class ProcessState:
             return []
         changed = []
         for number, handler in zip(_SIGNALS, self._handlers, strict=True):
-            is_other = getsignal(number) != handler
+            is_other = getsignal(number) is not handler  # it may be a plugin's, with any `__eq__`
             if handler is not None and (is_other or (self._whole and number in _OF_LIBRARIES)):
-                signal.signal(number, handler)
+                install(number, handler)
             if is_other:
                 changed.append(f"the handler of {number.name}")
         root = logging.getLogger()
@@ -86,7 +90,7 @@ class ProcessState:
             root.setLevel(self._level)
             changed.append("the level of the log")
         if root.handlers != self._log_handlers:
-            root.handlers[:] = self._log_handlers
+            root.handlers = self._log_handlers[:]
             changed.append("the handlers of the log")
         for (read, write, name), before in zip(_settings(), self._settings, strict=False):
             if read() != before:
@@ -120,12 +124,15 @@ class ProcessState:
 
     def _restore_environment(self) -> list[str]:
         """Restore the variables, which each process of a slave and its supervisor would get."""
-        before, after = self._environment, dict(os.environb)
+        before, after = self._environment, _VARIABLES.copy()
+        if before == after:
+            return []
         names = sorted({name for name, _ in before.items() ^ after.items()})
         for name in names:
             if name in before:
                 os.environb[name] = before[name]
-            else:
+                continue
+            with contextlib.suppress(KeyError):  # a thread has removed it since
                 del os.environb[name]
         shown = (sanitized(os.fsdecode(name), _LONGEST_NAME) for name in names[:_NAMED])
         return [f"the environment variable {name}" for name in shown]
@@ -190,7 +197,7 @@ class Interrupts:
         self.pressed = False
         self._watched = getsignal(signal.SIGINT) is signal.default_int_handler
         if self._watched:
-            signal.signal(signal.SIGINT, self._note)
+            install(signal.SIGINT, self._note)
 
     def _note(self, _number: int, _frame: Any) -> None:
         self.pressed = True
@@ -199,4 +206,4 @@ class Interrupts:
     def end(self) -> None:
         """Install the handler that was there before."""
         if self._watched:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+            install(signal.SIGINT, signal.default_int_handler)

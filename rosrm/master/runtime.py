@@ -342,13 +342,13 @@ class MasterRuntime:
                     self._beat(now)
                 if now >= next_restore:  # what a plugin has changed in a thread
                     next_restore = now + _RESTORE_PERIOD
-                    self._process.restore()
+                    self._participant.guard.call(self._process.restore)
                 self._take_in(now)
                 next_tick = min(next_tick, now + self._until_loss(now))
                 if self._diagnostics is not None:
                     self._diagnostics.advance(now, self._core_now(now), self._trouble())
                 self._endpoint.load.note_turn(self._now() - now)
-            self._process.restore()  # so that the log has the end
+            self._participant.guard.call(self._process.restore)  # so that the log has the end
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
 

@@ -81,7 +81,7 @@ def read_processes(probe: Probe, resources: Sequence[ResourceDescription]) -> Us
     if unknown or missing:
         which = "announces no" if unknown else "lacks the attributed"
         raise PluginError(f"by_process() {which} {', '.join(map(str, unknown or missing))}")
-    return {name: _amounts(name, _mapping(answer[name])) for name in names & answer.keys()}
+    return {name: _amounts(name, _mapping(answer[name])) for name in names if name in answer}
 
 
 def read_devices(probe: Probe) -> tuple[Device, ...]:

@@ -417,7 +417,7 @@ class SlaveRuntime:
             guard.call(self._services.acknowledge_starts)
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
-        self._process.restore()  # so that the log has the end
+        guard.call(self._process.restore)  # so that the log has the end
 
     def _look_at_devices(self) -> None:
         """Report changes of the devices to the master, and lost ones to the core."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import gc
 import logging
 import os
@@ -302,6 +303,82 @@ def test_what_a_plugin_changes_in_a_decision_is_restored_within_a_second(harm: s
     assert _state() == before
 
 
+def test_a_thread_may_change_the_environment_while_it_is_restored() -> None:
+    """A library that sets a variable for the time of a call does so again and again."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    state, is_over = ProcessState(), threading.Event()
+    end = time.monotonic() + 30.0
+    names = [f"ROSRM_TEST_OF_THREAD_{number}" for number in range(200)]
+
+    def set_and_remove() -> None:
+        for _ in range(1_000):
+            for name in names:
+                os.environ[name] = "1"
+            for name in names:
+                with contextlib.suppress(KeyError):  # rosrm has removed it
+                    del os.environ[name]
+        is_over.set()
+
+    thread = threading.Thread(target=set_and_remove)
+    thread.start()
+    try:
+        while not is_over.is_set() and time.monotonic() < end:
+            state.restore()
+    finally:
+        thread.join(30.0)
+        sys.setswitchinterval(interval)
+        state.restore()
+
+
+class _Unequal:
+    """Handler of a signal that no code may compare."""
+
+    def __call__(self, *_: object) -> None:
+        """Handle a signal."""
+
+    def __eq__(self, _other: object) -> bool:
+        raise ZeroDivisionError("a bug")
+
+    __hash__ = object.__hash__
+
+
+@pytest.mark.parametrize(
+    "harm",
+    [
+        lambda: signal.signal(signal.SIGHUP, _Unequal()),
+        lambda: setattr(logging.getLogger(), "handlers", ()),
+        lambda: setattr(logging.getLogger(), "handlers", None),
+    ],
+    ids=["signal", "tuple of handlers", "no handlers"],
+)
+def test_what_a_plugin_leaves_in_other_types_is_restored(
+    harm: Callable[[], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The restoration relies on nothing that the plugin has set."""
+    root, handler = logging.getLogger(), signal.getsignal(signal.SIGHUP)
+    monkeypatch.setattr(root, "handlers", root.handlers)
+    before = _state()
+    try:
+        guarded(harm, whom="filter 'odd'")
+        assert _state() == before
+    finally:
+        signal.signal(signal.SIGHUP, handler)
+
+
+def test_what_cannot_be_restored_costs_the_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error of the restoration is one of the plugin, and ends no part."""
+
+    class Log(list[Any]):
+        def __ne__(self, _other: object) -> bool:
+            raise ZeroDivisionError("a bug")
+
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", root.handlers)
+    with pytest.raises(PluginError, match="a bug"):
+        guarded(lambda: setattr(root, "handlers", Log()), whom="filter 'odd'")
+
+
 def test_what_rosrm_has_changed_itself_stays() -> None:
     """The end of the start sets the thresholds of the collection for the time of the service."""
     state, before = ProcessState(), gc.get_threshold()
@@ -456,6 +533,20 @@ def test_a_call_in_a_thread_takes_no_limit_from_a_call_of_the_loop() -> None:
     finally:
         ended.set()
         thread.join(30.0)
+
+
+def test_calls_in_threads_begin_no_pause() -> None:
+    """Many starts ask a strategy in threads, which wait for each other but hold no loop."""
+    calls = PluginCalls(Deadlines(0.02, pause=60.0))
+
+    def in_thread() -> None:
+        for _ in range(3):
+            calls.ask(*PLUGIN, "mask", lambda: time.sleep(0.1))
+
+    thread = threading.Thread(target=in_thread)
+    thread.start()
+    thread.join(30.0)
+    assert calls.ask(*PLUGIN, "mask", lambda: 7) == 7
 
 
 def test_quick_calls_begin_no_pause() -> None:
