@@ -13,6 +13,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ from rosrm import clocks, threads
 from rosrm.component import link
 from rosrm.node.identity import made_for
 from rosrm.runtime.signalling import send
+from rosrm.wording import reason_of
 
 #: Makes a node by the name of its component and its command line; raises what the component raises.
 Make = Callable[[str, Sequence[str]], Node]
@@ -31,6 +33,10 @@ _RETRY: Final = 0.2
 #: active elsewhere, because the process was fenced.
 _PATIENCE: Final = 2.0
 _LOOK: Final = 0.02
+
+
+#: What the constructor of a component may raise: `sys.exit` in it ends no other component.
+FAULTS: Final = (Exception, SystemExit)
 
 
 class ComponentLinks:
@@ -54,7 +60,7 @@ class ComponentLinks:
     def close(self) -> None:
         """Destroy all nodes; their processes end with this one."""
         for node in self.nodes:
-            node.destroy_node()
+            destroy(node, self._log.error)
 
     def _listen(self) -> None:
         """Accept links, once an earlier container of the same name has released the address."""
@@ -75,10 +81,15 @@ class ComponentLinks:
         try:
             connection, _ = listening.accept()
         except OSError as error:
-            self._log.error(f"a component cannot be loaded now: {error.strerror}")
+            self._log.error(f"a component cannot be loaded now: {reason_of(error)}")
             time.sleep(_RETRY)
             return
-        threads.start(partial(self._serve, connection), "link")
+        try:
+            threads.start(partial(self._serve, connection), "link")
+        except RuntimeError as error:  # too many threads
+            self._log.error(f"a component cannot be loaded now: {error}")
+            with connection, suppress(OSError):  # the process was killed
+                link.send(connection, {"pid": os.getpid(), "fault": str(error)})
 
     def _serve(self, connection: socket.socket) -> None:
         """Make the node of a process, and destroy it when the process asks for that or ends."""
@@ -87,7 +98,7 @@ class ComponentLinks:
             if request is None:
                 return
             made: list[Node] = []
-            fault = self._run(lambda: made.append(self._made(request)))
+            fault = self._run(lambda: made.append(self._made(request, connection)))
             try:
                 link.send(connection, {"pid": os.getpid(), "fault": fault})
                 connection.recv(1)
@@ -96,7 +107,9 @@ class ComponentLinks:
             if made:
                 self._end(connection, made[0])
 
-    def _made(self, request: dict[str, Any]) -> Node:
+    def _made(self, request: dict[str, Any], connection: socket.socket) -> Node:
+        if _is_gone(connection):  # the executor was busy; another instance may be active by now
+            raise ProcessLookupError("its process has ended")
         with made_for(request["environment"]):
             node = self._make(str(request["plugin"]), list(request["arguments"]))
         self.nodes.append(node)
@@ -115,13 +128,10 @@ class ComponentLinks:
                 send(os.getpid(), signal.SIGKILL)
 
     def _destroy(self, node: Node) -> None:
-        """Destroy a node; its error must not end the executor, which serves the other nodes."""
+        """Destroy a node, in the executor."""
         self.nodes.remove(node)
         self._executor.remove_node(node)
-        try:
-            node.destroy_node()
-        except Exception as error:  # noqa: BLE001 - the component may raise anything
-            self._log.error(f"cannot destroy a component: {type(error).__name__}: {error}")
+        destroy(node, self._log.error)
 
     def _run(self, work: Callable[[], None]) -> str:
         """Run a function in the executor; return the error that it raised, "": none."""
@@ -131,7 +141,7 @@ class ComponentLinks:
         def call() -> None:
             try:
                 work()
-            except Exception as error:  # noqa: BLE001 - whatever the component raises is its answer
+            except FAULTS as error:
                 faults.append(f"{type(error).__name__}: {error}")
             if faults:
                 self._log.error(f"cannot load a component: {faults[0]}")
@@ -141,6 +151,14 @@ class ComponentLinks:
         self._executor.create_task(call)
         done.wait()
         return "".join(faults)
+
+
+def destroy(node: Node, report: Callable[[str], object]) -> None:
+    """Destroy a node; its error ends neither the executor nor the end of the other nodes."""
+    try:
+        node.destroy_node()
+    except FAULTS as error:
+        report(f"cannot destroy a component: {type(error).__name__}: {error}")
 
 
 def _is_bound(listening: socket.socket, where: str) -> bool:

@@ -27,7 +27,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
-from rosrm.node.component_links import ComponentLinks
+from rosrm.node.component_links import FAULTS, ComponentLinks, destroy
 from rosrm.node.identity import made_for
 from rosrm.ros.fast_dds import announcing
 from rosrm.ros.peer_announcements import request_announcements
@@ -63,21 +63,21 @@ class Container:
         self.node.create_service(LoadNode, f"{_SERVICES}/load_node", self._load)
         self.node.create_service(UnloadNode, f"{_SERVICES}/unload_node", self._unload)
         self.node.create_service(ListNodes, f"{_SERVICES}/list_nodes", self._list)
-        log = self.node.get_logger()
-        self._links = ComponentLinks(name, executor, new_node, log) if name else None
+        self._log = self.node.get_logger()
+        self._links = ComponentLinks(name, executor, new_node, self._log) if name else None
 
     def close(self) -> None:
         """Destroy all nodes."""
         if self._links is not None:
             self._links.close()
         for node in (*self._components.values(), self.node):
-            node.destroy_node()
+            destroy(node, self._log.error)
 
     def _load(self, request: Any, response: Any) -> Any:
         """Load a component; the answer says why that failed."""
         try:
             node = self._made(request)
-        except Exception as error:  # noqa: BLE001 - whatever the component raises is its answer
+        except FAULTS as error:
             response.error_message = f"{request.plugin_name}: {type(error).__name__}: {error}"
         if response.error_message:
             self.node.get_logger().error(f"cannot load {response.error_message}")
@@ -117,7 +117,7 @@ class Container:
             response.error_message = f"no component {request.unique_id}; loaded: {loaded}"
             return response
         self._executor.remove_node(node)
-        node.destroy_node()
+        destroy(node, self._log.error)
         response.success = True
         return response
 

@@ -5,11 +5,16 @@ from __future__ import annotations
 import os
 import resource
 import socket
+import sys
 import threading
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from types import SimpleNamespace
+from typing import Any
 
 from rosrm.component import link
+from rosrm.node import component_links
 from rosrm.node.component_links import ComponentLinks
 from tests.waiting import wait_until
 
@@ -73,3 +78,70 @@ def test_a_component_that_cannot_be_destroyed_does_not_end_its_container(tmp_pat
             assert link.receive(connection) == {"pid": os.getpid(), "fault": ""}
         wait_until(lambda: errors, "the error of the component is logged")
     assert errors == ["cannot destroy a component: ZeroDivisionError: division by zero"]
+
+
+@contextmanager
+def container(name: str, make: Callable[..., object], errors: list[str]) -> Iterator[Any]:
+    """Run a container with an executor of one thread."""
+    with ThreadPoolExecutor(1) as threads:
+        executor = SimpleNamespace(
+            create_task=threads.submit, add_node=lambda _: None, remove_node=lambda _: None
+        )
+        yield executor, ComponentLinks(name, executor, make, SimpleNamespace(error=errors.append))
+
+
+REQUEST = {"environment": {}, "plugin": "m:Node", "arguments": []}
+
+
+def test_a_component_that_exits_in_its_constructor_ends_no_other(tmp_path):
+    """`sys.exit` in it is its fault, as any other exception is."""
+    errors: list[str] = []
+    with container(str(tmp_path), lambda *_: sys.exit("no map"), errors):
+        for _ in range(2):
+            with connected(str(tmp_path)) as connection:
+                link.send(connection, REQUEST)
+                fault = {"pid": os.getpid(), "fault": "SystemExit: no map"}
+                assert link.receive(connection) == fault
+
+
+def test_a_container_without_a_further_thread_says_so(tmp_path, monkeypatch):
+    """Otherwise the process would report that its container has ended."""
+    errors: list[str] = []
+    with container(str(tmp_path), lambda *_: None, errors):
+        assert is_closed_by_container(connected(str(tmp_path)))
+
+        def refused(*_, **__):
+            raise RuntimeError("can't start new thread")
+
+        monkeypatch.setattr(component_links.threads, "start", refused)
+        with connected(str(tmp_path)) as connection:
+            assert link.receive(connection)["fault"] == "can't start new thread"
+    assert errors == ["a component cannot be loaded now: can't start new thread"]
+
+
+def test_no_node_is_made_for_a_process_that_has_ended(tmp_path):
+    """The executor was busy; the process was fenced, so another instance may be active."""
+    errors: list[str] = []
+    made: list[str] = []
+    busy, ended = threading.Event(), threading.Event()
+    with container(str(tmp_path), lambda *_: made.append("node"), errors) as (executor, _):
+        executor.create_task(lambda: (busy.set(), ended.wait(20.0)))
+        assert busy.wait(20.0)
+        with connected(str(tmp_path)) as connection:
+            link.send(connection, REQUEST)
+        ended.set()
+        wait_until(lambda: errors, "the refusal")
+    assert made == []
+
+
+def test_a_node_that_cannot_be_destroyed_keeps_no_other_from_its_end(tmp_path):
+    """Each node stores its last state at its end."""
+    destroyed: list[int] = []
+    errors: list[str] = []
+    with container(str(tmp_path), lambda *_: None, errors) as (_, links):
+        links.nodes += [
+            SimpleNamespace(destroy_node=lambda: 1 / 0),
+            SimpleNamespace(destroy_node=lambda: destroyed.append(1)),
+        ]
+        links.close()
+    assert destroyed == [1]
