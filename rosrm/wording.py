@@ -129,6 +129,14 @@ def one_line(reason: str) -> str:
     return reason.replace("\n", "; ")
 
 
+def reason_of(error: BaseException) -> str:
+    """Return the reason of an error without its number and path: "No space left on device".
+
+    An `OSError` that was made of a text alone, such as a time-out, has no `strerror`.
+    """
+    return getattr(error, "strerror", None) or str(error) or type(error).__name__
+
+
 def sendable(text: str) -> str:
     """Return a text with "?" for each character without a UTF-8 form, as in a path of other bytes.
 

@@ -32,6 +32,8 @@ _WALKS: Final = 20
 _REMOVE_AGAIN: Final = 0.2
 #: Links of a folder without folders in it.
 _LINKS: Final = 2
+#: Errors of a system without room for another descriptor.
+_NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 #: Bytes; a limit above this is none (version 1 writes 2**63 less a page).
 _NO_LIMIT: Final = 2**62
 
@@ -147,9 +149,10 @@ class InstanceGroups:
     def _undo(self, key: Key, tree: Tree) -> None:
         """Move processes back out of a group that not all could enter, and remove the group."""
         path = _path(tree, key)
-        for pid in pids(path):
-            with contextlib.suppress(OSError):
-                cgroups.write(os.path.join(tree.home, "cgroup.procs"), str(pid))
+        with contextlib.suppress(OSError):  # the group stays, and is removed with the instance
+            for pid in pids(path):
+                with contextlib.suppress(OSError):
+                    cgroups.write(os.path.join(tree.home, "cgroup.procs"), str(pid))
         remove_empty(path)
         if os.path.isdir(path):  # a process has forked during the loop
             self._unfinished.setdefault(key, set()).add(tree)
@@ -215,7 +218,11 @@ class InstanceGroups:
             own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
 
     def members(self, key: Key) -> list[int] | None:
-        """Return the pids of all processes of an instance; None: it has no group."""
+        """Return the pids of all processes of an instance; None: it has no group.
+
+        Raises:
+            OSError: the system has no room for a look.
+        """
         trees = self._made.get(key)
         if not trees:
             return None
@@ -298,17 +305,23 @@ def remove_empty(group: str) -> None:
 
 
 def pids(group: str) -> list[int]:
-    """Return the other processes in a group and those below it; [] if it is gone."""
+    """Return the other processes in a group and those below it; [] if it is gone.
+
+    Raises:
+        OSError: the system has no room for a look, so the group may have processes.
+    """
     try:
         listed = map(int, procfs.content(os.path.join(group, "cgroup.procs")).split())
         # 0: a process outside of our pid namespace; a signal to 0 would reach ourselves.
         found = [pid for pid in listed if pid not in (0, os.getpid())]
-        has_groups = os.stat(group).st_nlink > _LINKS
-    except OSError:
+        # More links: a process of the instance has made groups.
+        below = _folders_in(group) if os.stat(group).st_nlink > _LINKS else ()
+    except OSError as error:
+        if error.errno in _NO_ROOM:
+            raise
         return []
-    if has_groups:  # a process of the instance has made them
-        for name in _folders(group):
-            found += pids(os.path.join(group, name))
+    for name in below:
+        found += pids(os.path.join(group, name))
     return found
 
 
@@ -318,7 +331,10 @@ def kill(path: str) -> None:
         cgroups.write(os.path.join(path, "cgroup.kill"), "1")
     except OSError:  # version 1, or a kernel before 5.14
         for _ in range(_WALKS):
-            left = pids(path)
+            try:
+                left = pids(path)
+            except OSError:  # the caller kills what it knows, and looks again
+                return
             for pid in left:
                 send(pid, signal.SIGKILL)
             if not left:
@@ -466,10 +482,14 @@ def _counts(path: str) -> dict[str, int]:
 
 def _folders(path: str) -> set[str]:
     try:
-        with os.scandir(path) as entries:
-            return {entry.name for entry in entries if entry.is_dir(follow_symlinks=False)}
+        return _folders_in(path)
     except OSError:
         return set()
+
+
+def _folders_in(path: str) -> set[str]:
+    with os.scandir(path) as entries:
+        return {entry.name for entry in entries if entry.is_dir(follow_symlinks=False)}
 
 
 def group_name(key: Key) -> str:

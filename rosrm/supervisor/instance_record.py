@@ -45,6 +45,7 @@ from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.file_thread import Call, FileThread
 from rosrm.supervisor.messages import Launch
+from rosrm.wording import reason_of
 
 VERSION: Final = 1
 #: The file is compacted beyond this size, and beyond this multiple of its size after the last time.
@@ -91,7 +92,7 @@ def read(state: str) -> Recorded:
     except FileNotFoundError:
         return recorded
     except OSError as error:
-        raise InstanceRecordError(f"{path} cannot be read: {error.strerror}") from None
+        raise InstanceRecordError(f"{path} cannot be read: {reason_of(error)}") from None
     if tail:
         recorded.notes.append(f"{path}: the last {len(tail)} bytes, a torn line, were left out")
     for number, line in enumerate(written, 1):
@@ -362,8 +363,8 @@ class InstanceRecord:
                 self._file = open_private(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
                 text = b"\n" + text
             written = os.write(self._file, text)
-        except OSError as error:
-            return _Outcome(text, error.strerror or str(error))
+        except Exception as error:  # noqa: BLE001 - no fault may lose the lines
+            return _Outcome(text, reason_of(error))
         self._size += written
         rest = text[written:]
         return _Outcome(rest, "No space left on device, after a part of it" if rest else "")
@@ -373,8 +374,8 @@ class InstanceRecord:
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * max(self._size, len(text)))
         try:
             file = atomic_file.replace(self._path, text, os.O_APPEND)
-        except OSError as error:
-            return _Outcome(waiting, error.strerror or str(error))
+        except Exception as error:  # noqa: BLE001 - as in `_append`
+            return _Outcome(waiting, reason_of(error))
         former, self._file = self._file, file
         self._size = len(text)
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._size)

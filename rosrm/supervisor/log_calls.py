@@ -79,10 +79,16 @@ class LogCalls:
         self.disk.tell(partial(self._keeper.watch, instance, now, started))
 
     def release(self, instance: Key) -> None:
-        """Check the log of an ended instance a last time, and stop watching it."""
+        """Check the log of an ended instance a last time, and stop watching it.
+
+        Raises:
+            OSError: the log cannot be checked or closed.
+        """
         if instance in self._known:
             self._known.remove(instance)
-            self.disk.ends(self.disk.begin(partial(self._release, instance)))
+            call = self.disk.begin(partial(self._release, instance))
+            if self.disk.ends(call):
+                call.result()
 
     def _release(self, instance: Key) -> None:
         log = self._opened.pop(instance, None)

@@ -200,7 +200,10 @@ class ProcessTrees:
 
     def _has_others(self, key: Key, leader: int) -> bool:
         """Return True if an instance whose leader was just reaped may have other processes."""
-        members = self._groups.members(key)
+        try:
+            members = self._groups.members(key)
+        except OSError:  # the exit code may not be lost; `_report_ends` looks again
+            return True
         # Checked at once: the pid is not reused until its process group is empty.
         return procfs.group_is_alive(leader) if members is None else bool(members)
 
@@ -212,7 +215,11 @@ class ProcessTrees:
         return procfs.find_members(leader, mark(key), self._state) if found is None else found
 
     def in_group(self, key: Key) -> list[Stat] | None:
-        """Return the living processes in the group of an instance; None: it has no group."""
+        """Return the living processes in the group of an instance; None: it has no group.
+
+        Raises:
+            OSError: the system has no room for a look.
+        """
         members = self._groups.members(key)
         if members is None:
             return None

@@ -332,6 +332,9 @@ class Server:
                 delayed.append(key)
             except OSError as error:
                 self._spawn_failed(key, _no_room(error), transient=True)
+            except Exception as fault:  # noqa: BLE001 - the core counts on an outcome of each
+                own_log.write_fault(f"the start of {mark(key)} failed")
+                self._spawn_failed(key, f"its start failed in the supervisor: {fault!r}", False)
         self._spawns.extendleft(reversed(delayed))
 
     def _late_disk(self) -> FileThread | None:
@@ -750,7 +753,7 @@ class Server:
     def _signalled(self, signals: int) -> None:
         numbers = os.read(signals, 4096)
         if signal.SIGCHLD in numbers:
-            self._trees.reap()
+            _guarded(self._trees.reap)  # its failure may lose no SIGTERM
         if signal.SIGTERM in numbers:
             self._happened(events.ShutdownOrdered())
 

@@ -332,3 +332,13 @@ def test_a_take_over_that_fails_serves_nobody(server, monkeypatch):
     monkeypatch.setattr(it, "_round", lambda: pytest.fail("it serves"))
     with pytest.raises(OSError, match="in system"):
         it.run()
+
+
+def test_a_bug_in_one_start_leaves_no_other_without_an_outcome(server, monkeypatch):
+    """Starts are taken from the queue together; each must end, whatever the first one raises."""
+    its, failed = server(), []
+    monkeypatch.setattr(its, "_spawn", lambda key: 1 // key[1])
+    monkeypatch.setattr(its, "_spawn_failed", lambda key, reason, transient: failed.append(key))
+    its._spawns.extend([("a", 0), ("b", 1), ("c", 0)])
+    its._spawn_some()
+    assert failed == [("a", 0), ("c", 0)]

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.supervisor import log_index, logs, paths
+from rosrm.supervisor.log_calls import LogCalls
 from rosrm.supervisor.log_index import Mark
 from rosrm.supervisor.logs import LogKeeper, LogLimits
 
@@ -82,3 +83,16 @@ def test_an_index_without_room_stays_as_it_was(state, monkeypatch):
     assert log_index.base(log) == 4711
     folder = Path(paths.log_folder(state))
     assert [path.name for path in folder.iterdir()] == ["talker.1.log.times"]
+
+
+def test_a_failed_release_of_a_log_is_reported(state, monkeypatch):
+    """The caller logs it; otherwise the log would stay open, and no one would know."""
+    calls = LogCalls(state, LogLimits())
+    calls.prepare(("talker", 1))
+
+    def fails(_keeper: LogKeeper, _instance: object) -> None:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(LogKeeper, "release", fails)
+    with pytest.raises(OSError, match="Input/output error"):
+        calls.release(("talker", 1))

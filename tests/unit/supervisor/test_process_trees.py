@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import os
 import selectors
 import signal
@@ -12,7 +14,8 @@ from rosrm.core.supervisor.instance import UNKNOWN_EXIT, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import RestartRule, StopRule
 from rosrm.supervisor import descriptors, procfs, takeover
-from rosrm.supervisor.instance_groups import InstanceGroups
+from rosrm.supervisor.group_trees import Tree
+from rosrm.supervisor.instance_groups import InstanceGroups, group_name
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
@@ -161,3 +164,38 @@ def end_another(its: ProcessTrees) -> None:
     os.waitid(os.P_PID, other.pid, os.WEXITED | os.WNOWAIT)
     its.reap()
     other.poll()
+
+
+def test_a_group_that_cannot_be_read_now_is_not_empty(tmp_path, monkeypatch):
+    """Without a free descriptor, the children of an ended leader are found later; none is lost."""
+    tree = Tree(2, str(tmp_path), str(tmp_path), ("memory",))
+    groups = InstanceGroups((tree,))
+    sleeper = subprocess.Popen(["sleep", "100"], start_new_session=True)
+    leader = subprocess.Popen(["sh", "-c", "exit 7"], start_new_session=True)
+    group = tmp_path / group_name(TALKER)
+    group.mkdir()
+    (group / "cgroup.procs").write_text(f"{sleeper.pid}\n")
+    groups.find_again({TALKER: 0})
+    happened: list[object] = []
+    its = ProcessTrees(
+        str(tmp_path), selectors.DefaultSelector(), happened.append, groups, lambda _: None
+    )
+    its.add_child(TALKER, leader.pid, procfs.ticks_now())
+    content = procfs.content
+
+    def full(path: str) -> bytes:
+        if path.startswith(str(tmp_path)):
+            raise OSError(errno.ENFILE, "Too many open files in system")
+        return content(path)
+
+    try:
+        os.waitid(os.P_PID, leader.pid, os.WEXITED | os.WNOWAIT)
+        with monkeypatch.context() as now, contextlib.suppress(OSError):
+            now.setattr(procfs, "content", full)
+            its.reap()
+        its.look(1.0)
+        (ended,) = happened
+        assert (ended.code, ended.leftovers) == (7, True)
+    finally:
+        sleeper.kill()
+        sleeper.wait()

@@ -299,3 +299,21 @@ def test_lines_that_wait_for_a_disk_are_bounded(tmp_path, core, stuck, monkeypat
     recorded = rc.read(str(tmp_path))
     assert list(recorded.instances) == [TALKER]
     assert recorded.instances[TALKER].exit_code == 3
+
+
+@pytest.mark.parametrize("fault", [MemoryError(), OSError()])
+def test_no_fault_of_a_write_loses_a_line(tmp_path, core, record, monkeypatch, fault):
+    """A fault may have no text and no number; the lines are written once it is over."""
+    record.state(core.instances[TALKER], 77)
+
+    def fails(*_):
+        raise fault
+
+    with monkeypatch.context() as now:
+        now.setattr(rc, "open_private", fails)
+        now.setattr(os, "write", fails)
+        assert not record.flush()
+        assert not record.flush()
+    assert type(fault).__name__ in record.trouble
+    assert record.flush()
+    assert rc.read(str(tmp_path)).births == {TALKER: 77}

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
+import os
 import re
 import signal
+from types import SimpleNamespace
 from typing import get_args
 
 import hypothesis.strategies as st
@@ -836,3 +839,21 @@ def test_a_bug_in_a_part_of_the_loop_does_not_end_the_parent_of_all_processes(mo
     monkeypatch.setattr(server, "PAUSE_AFTER_FAULT", 0.0)
     server._guarded(lambda: 1 / 0)
     assert notes == ["a part of the loop failed: division by zero"]
+
+
+def test_a_failed_look_at_ended_children_loses_no_order_to_end(monkeypatch):
+    """SIGCHLD and SIGTERM may arrive together, when the system has no room for a look."""
+    monkeypatch.setattr(server, "PAUSE_AFTER_FAULT", 0.0)
+    monkeypatch.setattr(server.own_log, "write_fault", lambda _: None)
+    happened = []
+
+    def reap():
+        raise OSError(errno.ENFILE, "Too many open files in system")
+
+    its = SimpleNamespace(_trees=SimpleNamespace(reap=reap), _happened=happened.append)
+    ours, theirs = os.pipe()
+    os.write(theirs, bytes([signal.SIGCHLD, signal.SIGTERM]))
+    server.Server._signalled(its, ours)
+    os.close(ours)
+    os.close(theirs)
+    assert happened == [ShutdownOrdered()]
