@@ -9,6 +9,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -39,6 +40,10 @@ def process():
 
 def full(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def full_first(*_: object, **__: object) -> None:
+    raise OSError(errno.ENOSPC, "the first error")
 
 
 def here(state: Path, instance: str, pid: int) -> dict[str, object]:
@@ -127,9 +132,9 @@ def test_a_checkpoint_without_its_ports_lets_the_process_run_on(
         full()
 
     monkeypatch.setattr(checkpoint, "find", lambda: criu)
-    monkeypatch.setattr(udp_ports, "write", full)
+    monkeypatch.setattr(udp_ports, "write", full_first)
     monkeypatch.setattr(checkpoint, "_discard", discard)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="the first error"):
         checkpoint.keep(here(tmp_path, "p#1", process.pid))
     assert stopped == [False]
     assert not process_tree.is_stopped(process.pid)
@@ -159,10 +164,10 @@ def test_a_failed_dump_calls_the_node_back_first(tmp_path, process, monkeypatch,
         return call
 
     monkeypatch.setattr(move, "control_of", lambda _: tmp_path)
-    monkeypatch.setattr(artifacts, "open_sender", full)
+    monkeypatch.setattr(artifacts, "open_sender", full_first)
     monkeypatch.setattr(move, "call_back", note("call_back"))
     monkeypatch.setattr(artifacts, "withdraw", note("withdraw"))
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="the first error"):
         move.checkpoint({**here(tmp_path, "p#1", process.pid), "attempt": f"failed {trouble}"})
     assert done == ["call_back", "withdraw"]
 
@@ -178,9 +183,9 @@ def test_a_node_that_was_not_called_back_stays_noted(
             full()
 
     monkeypatch.setattr(periodic, "control_of", lambda _: tmp_path / "control")
-    monkeypatch.setattr(periodic, "leave", full)
+    monkeypatch.setattr(periodic, "leave", full_first)
     monkeypatch.setattr(periodic, "call_back", call_back)
-    with pytest.raises(CriuError, match="No space left"):
+    with pytest.raises(CriuError, match="the first error"):
         periodic.dump(here(tmp_path, "p#1", process.pid))
     away = tmp_path / "images" / "periodic-1" / "away"
     assert away.exists() is not is_called_back
@@ -203,3 +208,21 @@ def test_a_node_that_cannot_be_called_back_is_reported(tmp_path, process):
     away.write_text("p#1-periodic-1")
     with pytest.raises(CriuError, match="was not started to be moved by criu"):
         periodic.call_back_all(tmp_path, {"p#1": process.pid})
+
+
+def test_without_a_further_thread_the_receiving_end_is_closed_at_once(monkeypatch, caplog):
+    """The image was received; its use does not depend on the end of the transfer."""
+
+    def refused(*_: object, **__: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    closed: list[float] = []
+
+    def close() -> None:
+        closed.append(0.0)
+
+    monkeypatch.setattr(artifacts.threads.Thread, "start", refused)
+    artifacts.close_soon(SimpleNamespace(close=close))
+    artifacts.remove_unused_later(Path("image"), 60.0)
+    assert closed == [0.0]
+    assert "_remove_if_idle in 60 s: can't start new thread" in caplog.text

@@ -6,8 +6,10 @@ unused ones are removed after a time.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import threading
+import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final
@@ -16,9 +18,10 @@ from rosrm import threads
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, incoming, numbers, outgoing
 from rosrm_criu.engine.restore_result import Outcome
-from rosrm_criu.executors.request import StepArguments, without_log_names
+from rosrm_criu.executors.request import StepArguments, undoing, without_log_names
 from rosrm_criu.transfer import Fetcher, Sender
 
+_log: Final = logging.getLogger("rosrm.criu")
 #: Seconds after which an image that a killed slave has left is no longer needed for a start.
 _LEFT_BEHIND: Final = 120.0
 
@@ -87,11 +90,8 @@ def open_fetcher(number: int, keep: float) -> str:
         keep: seconds after which an unused end is closed.
     """
     fetcher = Fetcher()
-    try:
+    with undoing(fetcher.close):  # no other code would close this end
         certificate = fetcher.introduce()
-    except BaseException:  # any error: no other code would close this end
-        fetcher.close()
-        raise
     with _changing:
         former = _fetchers.get(number)
         _fetchers[number] = fetcher
@@ -217,7 +217,19 @@ def number_of(instance: str) -> int:
 
 
 def call_later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:
-    """Call a function later, in a thread that does not keep the slave from ending."""
-    timer = threading.Timer(seconds, do, arguments)
-    timer.daemon = True
-    timer.start()
+    """Call a function later, in a thread that does not keep the slave from ending.
+
+    Without a further thread, call it now if it is due, and otherwise leave it to `sweep`.
+    """
+
+    def call() -> None:
+        time.sleep(seconds)
+        do(*arguments)
+
+    try:
+        threads.start(call, f"criu: {do.__name__}")
+    except RuntimeError as fault:
+        if not seconds:
+            do(*arguments)
+        else:
+            _log.error("%s in %g s: %s", do.__name__, seconds, fault)

@@ -14,6 +14,7 @@ import socket
 import threading
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -30,7 +31,7 @@ from rosrm_criu.engine import (
 from rosrm_criu.engine.binary import find
 from rosrm_criu.engine.paths import checkpoint, checkpoint_ports, incoming, numbers
 from rosrm_criu.executors import artifacts, attempts
-from rosrm_criu.executors.request import StepArguments, without_log_names
+from rosrm_criu.executors.request import StepArguments, undoing, without_log_names
 from rosrm_criu.plans import KEEP, TAKE
 
 #: Sockets that reserve the ports of checkpointed processes, by the number of the instance.
@@ -66,17 +67,14 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
     directory, began = checkpoint(asked.state, asked.source), clocks.boot_time()
     artifacts.discard(directory)
     attempts.check_wanted(asked.attempt)
-    try:
+    # After any error the process continues, and nothing is left behind.
+    with undoing(partial(dump.resume, pid), lambda: _discard(asked.state, asked.source)):
         with without_log_names():
             manifest = dump.dump(
                 find(), pid, directory, leave="stopped", timeout=asked.timeout,
                 process=asked.process, instance=asked.source,
             )  # fmt: skip
         udp_ports.write(checkpoint_ports(asked.state, asked.source), udp_ports.bound(pids))
-    except BaseException:  # any error: the process continues, and nothing is left behind
-        dump.resume(pid)
-        _discard(asked.state, asked.source)
-        raise
     return {"size": manifest.size, "seconds": {"dump": clocks.boot_time() - began}}
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from rosrm_criu.executors import artifacts, attempts, periodic, precopy
 from rosrm_criu.executors.attempts import Answer
 from rosrm_criu.executors.checkpoint import reserve_all
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
-from rosrm_criu.executors.request import StepArguments, without_log_names
+from rosrm_criu.executors.request import StepArguments, undoing, without_log_names
 from rosrm_criu.plans import CHECKPOINT, FETCH, INTRODUCE
 from rosrm_criu.transfer import Offer, Sender, missing
 
@@ -90,7 +91,9 @@ def _checkpoint(asked: StepArguments) -> Answer:
 def _checkpoint_alone(asked: StepArguments) -> Answer:
     pid = asked.leader(asked.source)
     control = control_of(pid)
-    try:
+    # Any error: the node rejoins, and afterwards the sender ends, because that takes a while.
+    back = partial(call_back, pid, control, asked.attempt)
+    with undoing(back, partial(artifacts.withdraw, asked.state, asked.source)):
         sender = artifacts.open_sender(asked.source)
         began = clocks.boot_time()
         left = leave(pid, control, asked.attempt, float(asked.arguments["seconds"]["leave"]))
@@ -98,12 +101,6 @@ def _checkpoint_alone(asked: StepArguments) -> Answer:
         directory, dump_part = _dump(pid, asked)
         offered = clocks.boot_time()
         offer = _offer(sender, directory, asked)
-    except Exception:  # any error: the node rejoins
-        try:
-            call_back(pid, control, asked.attempt)
-        finally:  # afterwards, because the end of the sender takes a while
-            artifacts.withdraw(asked.state, asked.source)
-        raise
     return {
         "offer": offer.as_json(), "control": str(control), "uid": owner_of(pid), "size": offer.size,
         "seconds": {

@@ -24,7 +24,7 @@ from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.slots import Rejoin
 from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors.freeze import call_back, control_of, has_failed, leave, owner_of
-from rosrm_criu.executors.request import StepArguments, without_log_names
+from rosrm_criu.executors.request import StepArguments, undoing, without_log_names
 
 #: File beside the images of an instance, with the id of its departure while the node is away.
 _AWAY: Final = "away"
@@ -59,17 +59,18 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
     slots.discard_unfinished(parent)
     slot, began = slots.new_slot(parent), clocks.boot_time()
     (parent / _AWAY).write_text(asked.attempt, encoding="utf-8")
-    try:
+
+    def discard() -> None:
+        shutil.rmtree(slot, ignore_errors=True)
+        if has_failed(control):  # its restart policy starts it from the previous image
+            dumping.kill(pid)
+
+    with undoing(discard):  # after any error the image is useless
         manifest, left = _dump_away(asked, pid, control, slot)
         dumped = clocks.boot_time()
         status = await_joined(control, asked.attempt, _seconds(asked, "join"), root)
         joined = clocks.boot_time()
         _add_checksums(slot, manifest)
-    except BaseException:  # any error: the image is useless
-        shutil.rmtree(slot, ignore_errors=True)
-        if has_failed(control):  # its restart policy starts it from the previous image
-            dumping.kill(pid)
-        raise
     slots.complete(slot, Rejoin(str(control), asked.attempt, owner_of(pid)))
     return {
         "size": manifest.size, "missing": list(status.missing),
@@ -81,7 +82,12 @@ def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:
 
 def _dump_away(asked: StepArguments, pid: int, control: Path, slot: Path) -> tuple[Manifest, float]:
     """Dump the node; return the manifest and the time of departure. The node always rejoins."""
-    try:
+
+    def back() -> None:
+        call_back(pid, control, asked.attempt)
+        (slot.parent / _AWAY).unlink(missing_ok=True)
+
+    with undoing(back):
         leave(pid, control, asked.attempt, _seconds(asked, "leave"))
         left = clocks.boot_time()
         with without_log_names():
@@ -89,9 +95,7 @@ def _dump_away(asked: StepArguments, pid: int, control: Path, slot: Path) -> tup
                 find(), pid, slot, leave="running", timeout=_seconds(asked, "dump"),
                 process=asked.process, instance=asked.source, checksums=False,
             )  # fmt: skip
-    finally:
-        call_back(pid, control, asked.attempt)
-        (slot.parent / _AWAY).unlink(missing_ok=True)
+    back()
     return manifest, left
 
 

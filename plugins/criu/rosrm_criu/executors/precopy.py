@@ -12,6 +12,7 @@ import threading
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -22,7 +23,7 @@ from rosrm_criu.engine.memory_copy import CHANGES, MemoryCopy, file_name
 from rosrm_criu.engine.paths import numbers, received_copy, sent_copy
 from rosrm_criu.executors import artifacts, attempts
 from rosrm_criu.executors.attempts import Answer
-from rosrm_criu.executors.request import StepArguments
+from rosrm_criu.executors.request import StepArguments, undoing
 from rosrm_criu.plans import (
     COPY_CHANGES,
     COPY_MEMORY,
@@ -160,7 +161,9 @@ def _offer(
         former: the first copy, if this is the second one.
     """
     sender = Sender()
-    try:
+    # After any error no other code would close this end. First the files, because the next attempt
+    # may soon use the same directory.
+    with undoing(partial(artifacts.discard, directory), sender.close):
         # Half of the timeout, because the sender must start after the copy and before the step
         # times out.
         made = copy(_check_until(asked.attempt, asked.timeout / 2))
@@ -172,11 +175,6 @@ def _offer(
         with _changing:
             attempts.check_wanted(asked.attempt)
             _sent[asked.source] = sent
-    except BaseException:  # any error: no other code would close this end
-        # First the files, because the next attempt may soon use the same directory.
-        artifacts.discard(directory)
-        sender.close()
-        raise
     if former is not None:
         former.sender.close()
     artifacts.call_later(

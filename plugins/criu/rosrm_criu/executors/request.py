@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from rosrm.errors import CriuError
+from rosrm.errors import CriuError, describe_fault
 from rosrm_criu.engine import process_tree
 
+_log: Final = logging.getLogger("rosrm.criu")
 #: References to CRIU's logs, which are removed with the image; the message has the cause.
 _LOG: Final = re.compile(r" \((its )?log: [^)]*\)")
 
@@ -81,3 +83,20 @@ def without_log_names() -> Iterator[None]:
         yield
     except CriuError as error:
         raise CriuError(_LOG.sub("", str(error))) from None
+
+
+@contextlib.contextmanager
+def undoing(*steps: Callable[[], object]) -> Iterator[None]:
+    """Call all steps after an error in this context; the error of a step is only logged.
+
+    The first error is the one to report, and no step needs the success of another one.
+    """
+    try:
+        yield
+    except BaseException as first:
+        for step in steps:
+            try:
+                step()
+            except Exception as fault:  # noqa: BLE001 - see above
+                _log.error("%s; then: %s", describe_fault(first), describe_fault(fault))
+        raise
