@@ -14,6 +14,7 @@ from rosrm.archive.layout import Segment, Source, read_segments
 from rosrm.errors import Refused
 from rosrm.model.rows import LogPart
 from rosrm.supervisor import log_index
+from rosrm.wording import reason_of
 
 #: Most bytes of a file that are read: a segment is smaller, unless it is damaged.
 _MOST: Final = 64 << 20
@@ -101,7 +102,7 @@ class LogArchive:
                 )
             self._segments = read_segments(directory)
         except OSError as error:
-            raise Refused(f"{directory} cannot be read: {error.strerror}") from None
+            raise Refused(f"{directory} cannot be read: {reason_of(error)}") from None
 
     def _sources(self, process: str) -> list[Source]:
         return [

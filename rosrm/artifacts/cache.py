@@ -23,6 +23,7 @@ from rosrm.model.artifacts import Artifact, set_key
 from rosrm.model.placeholders import ARTIFACTS
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
+from rosrm.wording import reason_of
 from rosrm.wording import size as sized
 
 #: Bytes of the disk that stay free.
@@ -240,5 +241,5 @@ def _link(source: Path, place: Path) -> None:
 
 def _unwritable(artifact: Artifact, path: Path, error: OSError) -> Refused:
     room = room_for(path)
-    reason = f"artifact {artifact.name!r} cannot be stored here: {error.strerror}"
+    reason = f"artifact {artifact.name!r} cannot be stored here: {reason_of(error)}"
     return Refused(f"{reason}; {room}" if room else reason, "full")

@@ -17,6 +17,7 @@ from typing import Final
 from rosrm.artifacts.unpack import CONTENT, MOST_ENTRIES, link_fault
 from rosrm.errors import ConfigError, Refused
 from rosrm.model.artifacts import name_fault
+from rosrm.wording import reason_of
 
 #: Bytes per read.
 _PIECE: Final = 1 << 18
@@ -33,7 +34,7 @@ def source_fault(source: str | Path) -> str:
     except FileNotFoundError:
         return f"{path}: there is no such file or directory"
     except (OSError, ValueError) as error:
-        return f"{path}: {getattr(error, 'strerror', None) or error}"
+        return f"{path}: {reason_of(error)}"
     if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         return f"{path}: neither a file nor a directory"
     rights = os.R_OK if stat.S_ISREG(mode) else os.R_OK | os.X_OK
@@ -89,7 +90,7 @@ class Archive:
         try:
             self._entries = list(_entries(self._source))
         except OSError as error:
-            raise ConfigError(f"{error.filename or source}: {error.strerror}") from None
+            raise ConfigError(f"{error.filename or source}: {reason_of(error)}") from None
         digest, self.size = sha256(), 0
         for piece in self._pieces():
             digest.update(piece)
@@ -152,7 +153,7 @@ def _content(entry: _Entry) -> Iterator[bytes]:
     except FileNotFoundError:
         raise changed(entry.path) from None
     except OSError as error:
-        raise ConfigError(f"{entry.path}: {error.strerror}") from None
+        raise ConfigError(f"{entry.path}: {reason_of(error)}") from None
 
 
 def _entries(source: Path) -> Iterator[_Entry]:

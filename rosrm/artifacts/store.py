@@ -17,6 +17,7 @@ from rosrm.model.artifacts import LARGEST_ARTIFACT, is_digest
 from rosrm.model.ledger import Store, bound_of
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
+from rosrm.wording import reason_of
 from rosrm.wording import size as sized
 
 #: Seconds for which contents stay that no process refers to, because their processes are about to
@@ -133,8 +134,8 @@ class ArtifactStore:
         except OSError as error:
             self._sizes.pop(digest, None)
             raise Refused(
-                f"the master cannot read the artifact {digest[:12]} ({error.strerror}); submit the "
-                "process again",
+                f"the master cannot read the artifact {digest[:12]} ({reason_of(error)}); submit "
+                "the process again",
                 "unknown",
             ) from None
 
@@ -239,5 +240,5 @@ def _changed(digest: str) -> Refused:
 
 def _unwritable(path: Path, error: OSError) -> Refused:
     room = room_for(path)
-    reason = f"the master cannot store an artifact: {error.strerror}"
+    reason = f"the master cannot store an artifact: {reason_of(error)}"
     return Refused(f"{reason}; {room}" if room else reason, "full")

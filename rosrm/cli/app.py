@@ -17,6 +17,7 @@ from typing import Final, NoReturn, TextIO
 
 from rosrm.cli.process import INTERRUPTED
 from rosrm.runtime.atomic_file import NO_ROOM
+from rosrm.wording import reason_of
 
 #: New objects after which Python looks for cycles: more than the imports of a command create, for
 #: which the default of 700 costs 10 % of a command's CPU time.
@@ -40,7 +41,7 @@ def _leave_removed_directory() -> None:
         os.getcwd()  # noqa: PTH109 - pathlib is not imported yet
     except OSError as error:
         os.chdir("/")
-        _say(f"rosrm: the current directory cannot be used ({error.strerror}); going on in /")
+        _say(f"rosrm: the current directory cannot be used ({reason_of(error)}); going on in /")
 
 
 def _open_closed_streams() -> None:
@@ -113,7 +114,7 @@ def _flush(stream: TextIO, status: int) -> bool:
     except OSError as error:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # else Python flushes again
         if error.errno != errno.EPIPE and status == 0:
-            _say(f"rosrm: the output cannot be written: {error.strerror}")
+            _say(f"rosrm: the output cannot be written: {reason_of(error)}")
         return False
     return True
 

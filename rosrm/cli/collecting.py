@@ -20,6 +20,7 @@ from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.dispositions import handled
 from rosrm.runtime.private_files import make_private_directory
 from rosrm.runtime.state_lock import only_one
+from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
     from rosrm.model.ros_settings import RosSettings
@@ -111,7 +112,7 @@ class Collecting:
                 raise
             self._note(str(refusal))
         except OSError as error:
-            reason = error.strerror or str(error)
+            reason = reason_of(error)
             self._note(
                 f"{self._directory} cannot be written: {reason}; {room_for(self._directory)}. "
                 "Collecting continues when it can be written again"
@@ -140,7 +141,9 @@ def _make(directory: Path) -> None:
             )
         make_private_directory(directory)
     except OSError as error:
-        raise ConfigError(f"the log archive {directory} cannot be used: {error.strerror}") from None
+        raise ConfigError(
+            f"the log archive {directory} cannot be used: {reason_of(error)}"
+        ) from None
 
 
 def _say(text: str) -> None:

@@ -19,6 +19,7 @@ from rosrm.errors import ConfigError
 from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.registry import Registry
 from rosrm.model.rows import PluginKind
+from rosrm.wording import reason_of
 
 #: One folder for each kind of plugin, and what they share.
 TEMPLATES: Final = Path(__file__).parent / "templates"
@@ -52,7 +53,7 @@ def create_package(kind: str, name: str, into: Path, registry: Registry) -> Path
             _write(kind, name, package)
             package.rename(folder)
     except OSError as error:
-        raise ConfigError(f"{folder} cannot be written: {error.strerror}") from None
+        raise ConfigError(f"{folder} cannot be written: {reason_of(error)}") from None
     return folder
 
 

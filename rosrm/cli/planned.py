@@ -13,7 +13,7 @@ from rosrm.errors import ConfigError, Refused
 from rosrm.model.applications import Action, ApplyResult, PlannedAction
 from rosrm.model.codec import from_plain
 from rosrm.model.rows import ProcessRow
-from rosrm.wording import few, listed
+from rosrm.wording import few, listed, reason_of
 
 
 class Request(Protocol):
@@ -33,7 +33,7 @@ def read_plan(path: str) -> ApplyResult | None:
     try:
         return from_plain(ApplyResult, json.loads(Path(path).read_bytes()))
     except OSError as fault:
-        why = fault.strerror or str(fault)
+        why = reason_of(fault)
     except (UnicodeDecodeError, json.JSONDecodeError):
         why = "the file is not JSON"
     except (KeyError, TypeError, ValueError) as fault:

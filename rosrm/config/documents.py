@@ -16,6 +16,7 @@ from typing import Any, Final, Union
 import yaml
 
 from rosrm.errors import ConfigError
+from rosrm.wording import reason_of
 
 #: Highest number of values in one file; values behind an alias count at each use of the alias.
 MOST_VALUES: Final = 200_000
@@ -195,7 +196,7 @@ def _text(path: Path) -> str:
             with path.open("rb") as file:
                 content = file.read(_LARGEST + 1)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
     if len(content) > _LARGEST:
         raise ConfigError(
             f"{path}: it has more than {_LARGEST >> 20} MiB, and is probably another file. Divide "

@@ -24,7 +24,7 @@ from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record
 from rosrm.runtime.disk_space import room_for
-from rosrm.wording import counted
+from rosrm.wording import counted, reason_of
 
 _BESIDE: Final = ("-wal", "-shm")
 #: A scan ends at a damaged page. So events are read from the end and in small groups. Intents are
@@ -95,7 +95,7 @@ def _recover(path: Path, wall: Callable[[], float]) -> str:
 
 
 def _not_recovered(path: Path, error: BaseException) -> JournalError:
-    why = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
+    why = reason_of(error)
     room = room_for(path)
     return JournalError(
         f"the journal {path} was not recovered and is unchanged: {why}. A recovery needs free "

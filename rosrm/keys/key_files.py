@@ -28,6 +28,7 @@ from rosrm.runtime.private_files import (
     open_own,
     open_private,
 )
+from rosrm.wording import reason_of
 
 #: File of the cluster's secret, on the master's machine alone.
 CLUSTER_FILE: Final = "cluster.key"
@@ -210,7 +211,7 @@ def write_key(path: Path, key: PrincipalKey) -> None:
     try:
         make_safe_directory(path.parent)
     except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+        raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from None
     _write(path, _fields_of(key))
 
 
@@ -328,7 +329,7 @@ def _read(path: Path) -> dict[str, Any] | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise ConfigError(f"the key file {path} cannot be used: {error.strerror}") from None
+        raise ConfigError(f"the key file {path} cannot be used: {reason_of(error)}") from None
     with os.fdopen(descriptor, "rb") as file:
         if mode & _OTHERS:
             raise ConfigError(
@@ -360,7 +361,7 @@ def _write(path: Path, fields: Mapping[str, Any]) -> None:
     try:
         os.close(atomic_file.replace(str(path), content, os.O_SYNC))
     except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+        raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from None
 
 
 @contextlib.contextmanager
@@ -374,7 +375,7 @@ def _locked(home: Path) -> Iterator[None]:
         lock = open_private(str(home / _LOCK_FILE), os.O_RDWR | os.O_CREAT)
     except OSError as error:
         raise ConfigError(
-            f"the directory of keys {home} cannot be used: {error.strerror}; ROSRM_KEYS can name "
+            f"the directory of keys {home} cannot be used: {reason_of(error)}; ROSRM_KEYS can name "
             f"another directory"
         ) from None
     try:

@@ -22,6 +22,7 @@ from rosrm.recording.encoding import decisions, encode, encode_decisions
 from rosrm.recording.frames import FrameKind, frame, opening
 from rosrm.recording.reader import Header
 from rosrm.runtime.private_files import make_safe_directory
+from rosrm.wording import reason_of
 
 _log = logging.getLogger("rosrm.master")
 
@@ -71,8 +72,8 @@ class Recorder:
             self._file.flush()
         except OSError as error:
             raise ConfigError(
-                f"record: nothing can be written into {directory}: {error.strerror}. Give another "
-                f"`record.directory`, or leave it out to record nothing"
+                f"record: nothing can be written into {directory}: {reason_of(error)}. Give "
+                f"another `record.directory`, or leave it out to record nothing"
             ) from None
         self._thread = threads.start(self._write, "rosrm recorder")
 
@@ -171,7 +172,7 @@ def _encoded(noted: _Noted) -> bytes:
 def _describe(fault: Exception) -> str:
     """Return a description of an exception."""
     if isinstance(fault, OSError):
-        return fault.strerror or str(fault)
+        return reason_of(fault)
     return f"{type(fault).__name__}: {fault}"
 
 

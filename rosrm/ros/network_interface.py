@@ -6,6 +6,7 @@ import socket
 
 from rosrm.errors import ConfigError
 from rosrm.model.ros_settings import INTERFACE_VARIABLE
+from rosrm.wording import reason_of
 
 
 def check_loopback() -> None:
@@ -15,8 +16,8 @@ def check_loopback() -> None:
             any_socket.connect(("127.0.0.1", 9))  # only looks for a route
         except OSError as error:
             raise ConfigError(
-                f"the loopback interface has no address ({error.strerror}), so the parts of rosrm "
-                "on this machine cannot reach each other; bring it up: `ip link set lo up`"
+                f"the loopback interface has no address ({reason_of(error)}), so the parts of "
+                "rosrm on this machine cannot reach each other; bring it up: `ip link set lo up`"
             ) from None
 
 

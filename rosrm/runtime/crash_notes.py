@@ -35,6 +35,7 @@ from typing import Any, Final
 from rosrm.extensions import guard
 from rosrm.extensions.guard import Crash
 from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.wording import reason_of
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -232,7 +233,7 @@ def kept_notes(directory: Path) -> Iterator[Sequence[Crash]]:
     try:
         notes = CrashNotes(directory)
     except OSError as fault:
-        _log.warning("no notes of the calls of plugins are kept: %s", fault.strerror)
+        _log.warning("no notes of the calls of plugins are kept: %s", reason_of(fault))
         yield ()
         return
     guard.keep_notes(notes)

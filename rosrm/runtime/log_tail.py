@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from typing import Final
 
+from rosrm.wording import reason_of
+
 #: Bytes at the end of a log that are read.
 _MOST: Final = 1 << 16
 
@@ -19,4 +21,4 @@ def last_lines(path: str | os.PathLike[str]) -> list[str]:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _MOST))
             return file.read(_MOST).decode(errors="replace").splitlines()
     except OSError as error:
-        return [f"(the log cannot be read: {error.strerror or error})"]
+        return [f"(the log cannot be read: {reason_of(error)})"]

@@ -12,6 +12,8 @@ import os
 from collections.abc import Iterator
 from typing import Final
 
+from rosrm.wording import reason_of
+
 #: Score of a protected agent. Not -1000, which exempts a process: a leak of the agent must end too.
 PROTECTED: Final = -900
 _FILE: Final = "/proc/self/oom_score_adj"
@@ -32,7 +34,7 @@ def protect() -> str:
         if present > PROTECTED:
             _set(PROTECTED)
     except OSError as error:
-        return f"{_FILE} cannot be lowered: {error.strerror}"
+        return f"{_FILE} cannot be lowered: {reason_of(error)}"
     _scores = (PROTECTED, present) if present > PROTECTED else (present, 0)
     return ""
 

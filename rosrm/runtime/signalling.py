@@ -12,6 +12,8 @@ import os
 import signal
 from collections.abc import Callable
 
+from rosrm.wording import reason_of
+
 
 def send(pid: int, number: int) -> str:
     """Send a signal to a process."""
@@ -34,5 +36,5 @@ def _sent(call: Callable[[int, int], None], target: int, number: int) -> str:
     except ProcessLookupError:
         return ""
     except OSError as error:  # a process of another user, or a filter of system calls
-        return error.strerror or str(error)
+        return reason_of(error)
     return ""

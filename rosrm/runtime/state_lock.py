@@ -13,6 +13,7 @@ from typing import Final, TextIO
 
 from rosrm.errors import ConfigError, Refused
 from rosrm.runtime.private_files import make_private_directory, open_private
+from rosrm.wording import reason_of
 
 #: Bytes of the pid in the lock, which are written in place: on a full disk the room of a shortened
 #: file may be taken at once.
@@ -65,7 +66,7 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
         )
     except OSError as error:
         raise ConfigError(
-            f"the state directory {directory} cannot be used: {error.strerror}; give this {role} "
+            f"the state directory {directory} cannot be used: {reason_of(error)}; give this {role} "
             f"another `state:`"
         ) from None
     if former:

@@ -12,7 +12,7 @@ from typing import Final
 
 from rosrm.model.devices import MOST_DEVICES, Device
 from rosrm.runtime.path_calls import PathCall, RunPath, at
-from rosrm.wording import listed, sanitized
+from rosrm.wording import listed, reason_of, sanitized
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -28,7 +28,7 @@ def file_fault(path: str) -> str:
         at(path)
         Path(path).stat()
     except OSError as error:
-        return f"{path}: {error.strerror or error}"
+        return f"{path}: {reason_of(error)}"
     return ""
 
 

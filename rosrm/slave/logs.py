@@ -15,6 +15,7 @@ from rosrm.model.values import InstanceId
 from rosrm.ros.slave.services import LogQuery
 from rosrm.supervisor import log_index, paths
 from rosrm.supervisor.client import log_path
+from rosrm.wording import reason_of
 
 #: Most bytes in one answer.
 _MOST: Final = 1 << 20
@@ -63,7 +64,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool, pid: int = 
                 break
             continue  # rotated during the read
         except OSError as error:
-            raise Refused(f"the log of {instance} cannot be read: {error.strerror}") from None
+            raise Refused(f"the log of {instance} cannot be read: {reason_of(error)}") from None
         if after == before:
             return part
     raise missing

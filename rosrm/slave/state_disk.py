@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.runtime.path_calls import PathCall, RunPath, at
+from rosrm.wording import reason_of
 
 #: Seconds between two looks.
 PERIOD: Final = 5.0
@@ -26,11 +27,11 @@ def fault_of(directory: Path) -> str:
         os.statvfs(directory)  # asks a server, unlike a file without a name, which few of them have
         file = os.open(directory, os.O_TMPFILE | os.O_WRONLY | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        return "" if error.errno in _NO_NAMELESS else error.strerror or str(error)
+        return "" if error.errno in _NO_NAMELESS else reason_of(error)
     try:
         written = os.write(file, bytes(ROOM))
     except OSError as error:
-        return error.strerror or str(error)
+        return reason_of(error)
     finally:
         os.close(file)
     return "" if written == ROOM else os.strerror(errno.ENOSPC)

@@ -18,6 +18,7 @@ from typing import Final
 from rosrm.model.values import InstanceState, InstanceStatus
 from rosrm.runtime import atomic_file
 from rosrm.runtime.path_calls import NoAnswer, at
+from rosrm.wording import reason_of
 
 #: Seconds between two versions of the file.
 PERIOD: Final = 15.0
@@ -77,7 +78,7 @@ class Textfile:
             at(path)
             os.close(atomic_file.replace(str(path), text_of(metrics, self._host), mode=_READABLE))
         except (OSError, NoAnswer) as error:
-            fault = getattr(error, "strerror", None) or str(error)
+            fault = reason_of(error)
         finally:
             self.is_being_written = False
         if fault and not self._fault:

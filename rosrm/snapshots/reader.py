@@ -19,6 +19,7 @@ from rosrm.snapshots.format import (
     decoded,
     decoded_head,
 )
+from rosrm.wording import reason_of
 
 #: Written by the node, in turn.
 SLOTS: Final = ("state.0", "state.1")
@@ -99,7 +100,7 @@ def content_of(path: Path) -> bytes:
         with os.fdopen(descriptor, "rb") as file:
             return file.read(min(os.fstat(descriptor).st_size, LARGEST_REPLICA))
     except OSError as error:
-        raise Damaged(f"it cannot be read: {error.strerror}") from None
+        raise Damaged(f"it cannot be read: {reason_of(error)}") from None
 
 
 def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:

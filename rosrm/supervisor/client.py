@@ -31,6 +31,7 @@ from rosrm.supervisor.client_values import (
 from rosrm.supervisor.discovery import connect_or_start, readable
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.send_buffer import MOST_UNSENT, Outgoing, Overfull
+from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -241,7 +242,7 @@ class SupervisorClient:
             self._outgoing.drop()
             raise full from None
         except OSError as error:
-            raise SupervisorGone(f"{self._name()} is gone: {error.strerror}") from None
+            raise SupervisorGone(f"{self._name()} is gone: {reason_of(error)}") from None
 
     # --- receiving ----------------------------------------------------------------------------
 
@@ -261,7 +262,7 @@ class SupervisorClient:
         except BlockingIOError:
             return
         except OSError as error:
-            self._lose(f"{self._name()} is gone: {error.strerror}")
+            self._lose(f"{self._name()} is gone: {reason_of(error)}")
             return
         if not data:
             self._lose(f"{self._name()} is gone; its processes keep running")

@@ -14,7 +14,7 @@ from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
 from rosrm.supervisor.spawn import TRANSIENT, Attempt, Scheduler
 from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
-from rosrm.wording import by_reason, listed
+from rosrm.wording import by_reason, listed, reason_of
 
 #: In place of the descriptor of a control group.
 NO_GROUP: Final = -1
@@ -144,7 +144,7 @@ class Confinement:
             except OSError as error:
                 if error.errno in TRANSIENT:
                     raise
-                fault = f"its control group cannot be entered: {error.strerror}"
+                fault = f"its control group cannot be entered: {reason_of(error)}"
                 # A supervisor beside this one may have removed the group, because it was empty.
                 faults = self._make_group(key, limits)
         faults = {name: fault for name in limits.wanted if name.startswith("limits.")}
@@ -178,7 +178,7 @@ def _on_cpus(cpus: tuple[int, ...], own: set[int]) -> Iterator[None]:
     try:
         os.sched_setaffinity(0, cpus)
     except OSError as error:
-        fault = f"{cpus_in_words(list(cpus))} cannot be used: {error.strerror}"
+        fault = f"{cpus_in_words(list(cpus))} cannot be used: {reason_of(error)}"
         raise SpawnError(fault) from None
     try:
         yield

@@ -16,6 +16,7 @@ from rosrm.errors import SupervisorError
 from rosrm.runtime import oom_score, private_files
 from rosrm.supervisor import endpoint
 from rosrm.supervisor.logs import LogLimits
+from rosrm.wording import reason_of
 
 _CHUNK: Final = 1 << 16
 
@@ -36,7 +37,7 @@ def connect_or_start(state: Path, start: bool, log: LogLimits, deadline: float) 
             if not start:
                 raise SupervisorError(f"no supervisor serves {state}") from None
         except OSError as error:
-            raise SupervisorError(f"{state} cannot be used: {error.strerror}") from None
+            raise SupervisorError(f"{state} cannot be used: {reason_of(error)}") from None
         problem = _start(state, log, deadline)
         if not problem:
             continue
@@ -65,7 +66,7 @@ def _start(state: Path, log: LogLimits, deadline: float) -> str:
                 umask=private_files.user_umask(),  # its processes inherit it
             )
     except OSError as error:  # most likely where the former one has ended for lack of memory
-        return f"its process cannot be started: {error.strerror}"
+        return f"its process cannot be started: {reason_of(error)}"
     assert process.stdout is not None
     with process.stdout as output:
         answer = b""

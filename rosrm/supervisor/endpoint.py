@@ -10,6 +10,7 @@ from typing import Final
 
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor import own_log, paths
+from rosrm.wording import reason_of
 
 #: First words of the error for a state directory that is served already.
 ANOTHER: Final = "another supervisor"
@@ -32,7 +33,7 @@ def listen(state: str) -> socket.socket:
         _lock(state)
         return _bind(state)
     except OSError as error:
-        reason = error.strerror or error
+        reason = reason_of(error)
         raise EndpointError(f"the state directory {state} cannot be used: {reason}") from None
 
 

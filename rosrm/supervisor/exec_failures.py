@@ -7,6 +7,8 @@ import os
 import struct
 from typing import Final
 
+from rosrm.wording import reason_of
+
 #: Most bytes of the first line that the kernel reads, and of the head of an ELF file looked at.
 _FIRST_LINE: Final = 256
 _HEAD: Final = 1 << 16
@@ -53,7 +55,7 @@ def _cause(path: str, error: OSError) -> str:
             return "its file is damaged, or no program: it begins as one (ELF)"
     elif error.errno == errno.ENOEXEC:
         return f"it is neither a program nor a script with #!{' (it is empty)' * (not head)}"
-    return str(error.strerror)
+    return reason_of(error)
 
 
 def _denied(path: str) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from rosrm.runtime import cgroups
+from rosrm.wording import reason_of
 
 #: Prefix of the group that contains the groups of one supervisor.
 PREFIX: Final = "rosrm-state-"
@@ -68,7 +69,7 @@ def find(state: str, root: str = "/") -> Enforcement:
     try:
         found = cgroups.mounts(root)
     except OSError as error:
-        unread = f"/proc/self/mountinfo cannot be read: {error.strerror}"
+        unread = f"/proc/self/mountinfo cannot be read: {reason_of(error)}"
         found, faults = [], dict.fromkeys(cgroups.LIMITING, unread)
     for mount in found:
         known = {name for tree in trees for name in tree.controllers}
@@ -158,7 +159,7 @@ def _why_not(mount: cgroups.Mount, error: OSError, root: str) -> str:
     if error.errno == errno.EBUSY:
         reason = f"other processes are in the control group {group}, or it is not delegated"
     else:
-        reason = f"no groups can be made below the control group {group}: {error.strerror}"
+        reason = f"no groups can be made below the control group {group}: {reason_of(error)}"
     return f"{reason}. To get it, {_HOW}"
 
 

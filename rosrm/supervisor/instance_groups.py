@@ -24,7 +24,7 @@ from rosrm.runtime.signalling import send
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
-from rosrm.wording import counted, size
+from rosrm.wording import counted, reason_of, size
 
 #: Most walks over the processes of a group of version 1, which may fork.
 _WALKS: Final = 20
@@ -109,7 +109,7 @@ class InstanceGroups:
                 made.append(tree)
                 faults.update(_set_limits(path, tree, limits))
             except OSError as error:
-                fault = f"no control group {path} can be made: {error.strerror}"
+                fault = f"no control group {path} can be made: {reason_of(error)}"
                 faults.update(
                     (name, fault) for name, controller in _CONTROLLER.items()
                     if controller in tree.controllers
@@ -141,7 +141,7 @@ class InstanceGroups:
                     _make(path, tree)
                     _move_all(_path(made[0], key), path)
                 except OSError as error:
-                    own_log.write(f"the control group {path} cannot be used: {error.strerror}")
+                    own_log.write(f"the control group {path} cannot be used: {reason_of(error)}")
                     self._undo(key, tree)
                 else:
                     self._made[key] = (*self._made[key], tree)
@@ -215,7 +215,7 @@ class InstanceGroups:
             unusable = self._homes.pop(home, None)
             if unusable is not None:
                 os.close(unusable)
-            own_log.write(f"the control group {home} cannot be entered again: {error.strerror}")
+            own_log.write(f"the control group {home} cannot be entered again: {reason_of(error)}")
 
     def members(self, key: Key) -> list[int] | None:
         """Return the pids of all processes of an instance; None: it has no group.
@@ -400,7 +400,7 @@ def _set_limits(
 def _why(path: str, file: str, error: OSError, limits: LimitRule) -> str:
     if error.errno == errno.EBUSY:  # of a former run, if the kernel has not given it back
         return _uses(_number(os.path.join(path, "memory.usage_in_bytes")), limits)
-    return f"{file} of the control group {path} cannot be written: {error.strerror}"
+    return f"{file} of the control group {path} cannot be written: {reason_of(error)}"
 
 
 def _uses(used: float, limits: LimitRule) -> str:

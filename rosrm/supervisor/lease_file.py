@@ -15,6 +15,7 @@ from rosrm.core.supervisor.events import ContactReported
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import own_log, paths, procfs
 from rosrm.supervisor.file_thread import FileThread
+from rosrm.wording import reason_of
 
 _NONE: Final = ContactReported(-inf, -inf)
 
@@ -51,7 +52,7 @@ class LastContact:
             os.pwrite(self._file, line.encode(), 0)
             self._trouble = ""
         except OSError as error:
-            trouble = error.strerror or str(error)
+            trouble = reason_of(error)
             if trouble != self._trouble:
                 own_log.write(f"{self._path} cannot be written: {trouble}")
             self._trouble = trouble

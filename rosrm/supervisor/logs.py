@@ -20,6 +20,7 @@ from rosrm.model.start_trace import LINE
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import log_index, own_log, paths
 from rosrm.supervisor.log_index import Mark
+from rosrm.wording import reason_of
 
 #: Seconds between two checks while logs grow, and while they do not.
 BUSY: Final = 0.2
@@ -270,7 +271,7 @@ class LogFolder:
         try:
             names = os.listdir(paths.log_folder(state))
         except OSError as error:  # its old logs stay until the next supervisor
-            own_log.write(f"{paths.log_folder(state)} cannot be listed: {error.strerror}")
+            own_log.write(f"{paths.log_folder(state)} cannot be listed: {reason_of(error)}")
             names = []
         found = map(paths.log_number, names)
         for name, number in sorted(filter(None, found), key=lambda log: log[1]):

@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final
 
-from rosrm.wording import printable
+from rosrm.wording import printable, reason_of
 
 #: Bytes beyond which the log is emptied.
 MOST_BYTES: Final = 1 << 20
@@ -74,7 +74,7 @@ def _written(line: str) -> bool:
         # Not by `sys.stderr`, whose buffer would repeat a failed line with each further one.
         os.write(_ERRORS, line.encode(errors="backslashreplace"))
     except OSError as error:
-        _why = error.strerror or str(error)
+        _why = reason_of(error)
         return False
     return True
 

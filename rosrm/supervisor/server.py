@@ -52,7 +52,7 @@ from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm.supervisor.spawn_error import SpawnError
-from rosrm.wording import listed
+from rosrm.wording import listed, reason_of
 
 #: Most starts before their exec at a time.
 SPAWNS_A_ROUND: Final = 8
@@ -492,7 +492,7 @@ class Server:
         except NoAnswer:
             raise
         except OSError as error:
-            message = f"its log cannot be opened: {error.strerror}"
+            message = f"its log cannot be opened: {reason_of(error)}"
             raise SpawnError(message, transient=True) from None
 
     def _program(self, launch: messages.Launch | None) -> spawn.Program:
@@ -775,7 +775,7 @@ def _guarded(call: Callable[..., None], *args: object) -> None:
 
 
 def _no_room(error: OSError) -> str:
-    return f"it cannot be started now: {error.strerror}"
+    return f"it cannot be started now: {reason_of(error)}"
 
 
 def _open_null() -> int:

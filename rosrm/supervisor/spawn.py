@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, NoReturn
 
 from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
+from rosrm.wording import reason_of
 
 #: Seconds for the steps of one start; after them, the path of the current step has no answer.
 PATIENCE: Final = 10.0
@@ -146,7 +147,7 @@ def _fork(group: int) -> tuple[int, bool]:
     try:
         return os.fork(), group < 0
     except OSError as error:
-        message = f"no process can be forked: {error.strerror}"
+        message = f"no process can be forked: {reason_of(error)}"
         raise SpawnError(message, transient=True) from None
 
 
@@ -243,7 +244,7 @@ def _enter(directory: str) -> None:
     try:
         os.chdir(directory)
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
-        reason = getattr(error, "strerror", None) or error
+        reason = reason_of(error)
         message = f"the working directory {directory!r} cannot be entered: {reason}"
         raise SpawnError(message) from None
 

@@ -11,6 +11,7 @@ from typing import Final
 from rosrm.errors import Refused
 from rosrm.model.adoption import LARGEST_PID
 from rosrm.supervisor import adoption, procfs
+from rosrm.wording import reason_of
 
 #: End of the path of a file that was removed, in a link of /proc.
 _DELETED: Final = " (deleted)"
@@ -54,7 +55,7 @@ def read_facts(pid: int) -> ProcessFacts:
         words = tuple(procfs.command_line(pid))
         environment, has_ros = environment_of(pid), _has_ros(pid)
     except OSError as error:
-        raise Refused(f"process {pid} cannot be read: {error.strerror}") from None
+        raise Refused(f"process {pid} cannot be read: {reason_of(error)}") from None
     program, directory = program.removesuffix(_DELETED), directory.removesuffix(_DELETED)
     return ProcessFacts(pid, stat.start, words, program, directory, environment, has_ros)
 

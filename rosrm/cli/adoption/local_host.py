@@ -14,7 +14,7 @@ from rosrm.model.ros_settings import RosSettings
 from rosrm.model.rows import HostRow
 from rosrm.supervisor import procfs
 from rosrm.supervisor.adoption import is_own
-from rosrm.wording import listed
+from rosrm.wording import listed, reason_of
 
 
 def local_host(hosts: Sequence[HostRow], wanted: str) -> HostRow:
@@ -63,4 +63,4 @@ def environment_on(host: HostRow, settings: RosSettings) -> Mapping[str, str]:
         domain = {DOMAIN: os.environ[DOMAIN]} if DOMAIN in os.environ else {}
         return {**environment_of(pid), **domain, **settings.environment()}
     except OSError as error:
-        raise Refused(f"the slave of {host.description.name}: {error.strerror}") from None
+        raise Refused(f"the slave of {host.description.name}: {reason_of(error)}") from None

@@ -17,6 +17,7 @@ from rosrm.cli.options import CommonOptions, Domain
 from rosrm.cli.output.plain import echo
 from rosrm.cli.systemd_unit import MARK, Part, needed_variables, unit_name, unit_text, wanted_by
 from rosrm.errors import ConfigError, RosrmError
+from rosrm.wording import reason_of
 
 service = typer.Typer(
     no_args_is_help=True, help="Run the master or the slave as a service of systemd."
@@ -116,7 +117,7 @@ def remove(
     try:
         path.unlink()
     except OSError as error:
-        raise RosrmError(f"{path} cannot be removed: {error.strerror}") from None
+        raise RosrmError(f"{path} cannot be removed: {reason_of(error)}") from None
     echo(f"removed {path}; next: {systemctl} daemon-reload")
 
 
@@ -187,4 +188,4 @@ def _write(path: Path, text: str, command: str) -> None:
             f". Without the rights of root: `{command} ... --dry-run | sudo tee {path}`, or a unit "
             "of this user: --user"
         )  # fmt: skip
-        raise RosrmError(f"{path} cannot be written: {error.strerror}{how}") from None
+        raise RosrmError(f"{path} cannot be written: {reason_of(error)}{how}") from None

@@ -15,6 +15,7 @@ import typer
 
 from rosrm.cli.commands.runtimes import with_domain
 from rosrm.cli.options import CommonOptions, Domain
+from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
     from rosrm.config.settings import ClusterConfig
@@ -109,7 +110,7 @@ def _temporary_directory() -> Path:
     try:
         return Path(tempfile.mkdtemp(prefix="rosrm-up-"))
     except OSError as error:
-        text = f"no temporary directory for the state: {error.strerror}; give one by --state DIR"
+        text = f"no temporary directory for the state: {reason_of(error)}; give one by --state DIR"
         raise ConfigError(text) from None
 
 

@@ -22,7 +22,7 @@ from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.runtime.signalling import send
 from rosrm.supervisor import procfs
 from rosrm.testing.local_cluster import LocalCluster, Part
-from rosrm.wording import ending_of, listed
+from rosrm.wording import ending_of, listed, reason_of
 
 #: Seconds for all hosts to register.
 _REGISTER: Final = 30.0
@@ -207,7 +207,7 @@ def _claim(directory: Path) -> int:
         make_private_directory(directory)
         lock = open_private(str(directory / "up.lock"), os.O_RDWR | os.O_CREAT)
     except OSError as error:
-        raise ConfigError(f"--state {directory} cannot be used: {error.strerror}") from None
+        raise ConfigError(f"--state {directory} cannot be used: {reason_of(error)}") from None
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

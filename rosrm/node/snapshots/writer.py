@@ -22,6 +22,7 @@ from rosrm.node.steady_timer import steady_timer
 from rosrm.snapshots.format import LARGEST, Block
 from rosrm.snapshots.writer import SlotWriter
 from rosrm.version import PROTOCOL_VERSION
+from rosrm.wording import reason_of
 from rosrm_msgs.msg import StateMark, StatePart
 
 #: Share of a node's time for saving its state; `keep_every` may require a larger one.
@@ -227,7 +228,7 @@ class _Writer:
         if self._fault != str(error):
             self._fault = str(error)
             self._warn(
-                f"not saved: {error.strerror}, in {self._entities.identity.keep}. The node "
+                f"not saved: {reason_of(error)}, in {self._entities.identity.keep}. The node "
                 f"continues, and retries with each newer state"
             )
 

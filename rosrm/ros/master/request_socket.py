@@ -14,6 +14,7 @@ from rosrm.keys.security import Authority
 from rosrm.ros import master_socket
 from rosrm.ros.sealed import SealedEndpoints
 from rosrm.ros.sealed_codec import Envelope, encode
+from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -46,7 +47,7 @@ class RequestSocket:
         except OSError as fault:
             _log.warning(
                 "requests of this machine come over DDS, because the socket cannot be bound: %s",
-                fault.strerror,
+                reason_of(fault),
             )
             return
         self._listener.listen(_THREADS)

@@ -30,6 +30,7 @@ from rosrm.slave.launch.ros_arguments import join_arguments, parameters_text, ro
 from rosrm.supervisor import json_lines
 from rosrm.supervisor.client import log_path
 from rosrm.supervisor.client_values import LaunchOrder, limit_rule
+from rosrm.wording import reason_of
 
 #: Most bytes of command line and environment, as the supervisor receives them; the rest of its
 #: longest line is for the other fields.
@@ -183,7 +184,7 @@ def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> bool:
     except OSError as error:
         if error.errno in atomic_file.NO_ROOM:
             return False
-        raise LaunchError(f"the key of {instance} cannot be written: {error.strerror}") from None
+        raise LaunchError(f"the key of {instance} cannot be written: {reason_of(error)}") from None
     return True
 
 
@@ -217,5 +218,5 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
         path.touch(0o600)
         path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise LaunchError(f"the parameters cannot be written: {error.strerror}") from None
+        raise LaunchError(f"the parameters cannot be written: {reason_of(error)}") from None
     return str(path)

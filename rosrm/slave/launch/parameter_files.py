@@ -14,6 +14,7 @@ from rosrm.errors import LaunchError
 from rosrm.model.parameters import merged_parameters
 from rosrm.model.values import ParameterSource, ProcessSpec, qualified_name
 from rosrm.runtime.path_calls import at
+from rosrm.wording import reason_of
 
 #: Most bytes of a parameters file.
 _LARGEST: Final = 1 << 24
@@ -41,7 +42,7 @@ def _contents(spec: ProcessSpec) -> Iterator[ParameterSource]:
             for section in parse_parameters(_read(Path(source.file).expanduser())):
                 yield replace(section, file=source.file)
         except (OSError, RuntimeError, ValueError) as error:
-            why = getattr(error, "strerror", None) or str(error)
+            why = reason_of(error)
             raise LaunchError(f"parameters file {source.file!r}: {why}") from None
 
 

@@ -18,6 +18,7 @@ from rosrm.slave.replication.keys import StateKeys
 from rosrm.snapshots.format import LARGEST_REPLICA, Damaged, Head, TransferPart
 from rosrm.snapshots.reader import COPY, newest_content, newest_head, peek, snapshot_files
 from rosrm.snapshots.writer import CopyWriter, drop_snapshots, write_slot
+from rosrm.wording import reason_of
 
 #: Seconds for which a snapshot stays in memory between reads of its parts, and the most bytes of
 #: all snapshots in memory before older ones are dropped sooner.
@@ -194,7 +195,7 @@ class SnapshotStore:
             path.unlink(missing_ok=True)
             return str(fault)
         except OSError as error:
-            return f"it cannot be written: {error.strerror}"
+            return f"it cannot be written: {reason_of(error)}"
         path.unlink(missing_ok=True)
         return ""
 
@@ -232,7 +233,7 @@ class SnapshotStore:
             return self._take(part, bounded=bounded)
         except OSError as error:
             self._abandon(part.process)
-            return NotStored("full", f"it cannot be written: {error.strerror}")
+            return NotStored("full", f"it cannot be written: {reason_of(error)}")
         except Damaged as fault:
             return NotStored("damaged", str(fault))
 

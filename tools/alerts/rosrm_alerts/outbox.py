@@ -19,6 +19,7 @@ from typing import Final
 from rosrm.errors import RosrmError
 from rosrm.model.notices import Notice
 from rosrm.runtime.private_files import make_safe_directory, open_private
+from rosrm.wording import reason_of
 from rosrm_alerts.watch import Key, Subject
 
 #: Most notices that wait for one sink; beyond that the oldest are dropped.
@@ -63,7 +64,7 @@ class Outbox:
                 self._file.execute("DELETE FROM position WHERE 0")
         except (OSError, sqlite3.Error) as fault:
             hint = "; is another `rosrm alerts run` using it?" if "locked" in str(fault) else ""
-            why = getattr(fault, "strerror", None) or fault
+            why = reason_of(fault)
             raise OutboxError(f"{path}: the outbox cannot be opened: {why}{hint}") from fault
 
     def position(self) -> int | None:

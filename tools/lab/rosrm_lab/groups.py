@@ -23,6 +23,7 @@ from rosrm import clocks
 from rosrm.errors import LabError
 from rosrm.runtime import cgroups
 from rosrm.runtime.signalling import send
+from rosrm.wording import reason_of
 from rosrm_lab.plan import PREFIX, HostPlan
 
 Leaf = Literal["limited", "free", "own"]
@@ -281,12 +282,12 @@ def _remove_tree(tree: Path) -> str:
         except FileNotFoundError:
             continue
         except OSError as error:
-            return f"{folder}: {error.strerror}"
+            return f"{folder}: {reason_of(error)}"
     return ""
 
 
 def _cannot(hierarchy: Hierarchy, error: OSError) -> str:
-    where = f"control groups cannot be made under {hierarchy.mount}: {error.strerror}"
+    where = f"control groups cannot be made under {hierarchy.mount}: {reason_of(error)}"
     if isinstance(error, PermissionError) or "Read-only" in str(error):
         return f"{where}. A container gets the right with `docker run --privileged`"
     if hierarchy.version == 2:

@@ -21,6 +21,7 @@ from rosrm import clocks
 from rosrm.errors import LabError
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor.procfs import read_stat
+from rosrm.wording import reason_of
 from rosrm_lab import wires
 from rosrm_lab.plan import PREFIX, LabPlan
 from rosrm_lab.wires import Link
@@ -144,7 +145,7 @@ def make_private_folder(folder: Path) -> None:
         make_private_directory(folder.parent)
         make_private_directory(folder)
     except OSError as error:
-        raise LabError(f"the folder {folder} cannot be used: {error.strerror}") from None
+        raise LabError(f"the folder {folder} cannot be used: {reason_of(error)}") from None
 
 
 def image(lab: str, host: str) -> Path:

@@ -21,7 +21,7 @@ from rosrm.model.values import InstanceId
 from rosrm.recording.frames import is_record
 from rosrm.supervisor.client import log_path
 from rosrm.timeline.values import Failure
-from rosrm.wording import counted, sanitized
+from rosrm.wording import counted, reason_of, sanitized
 from rosrm_report.model import Material, Readings, Report
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def read_source(path: Path) -> Material:
         with path.open("rb") as file:
             beginning = file.read(64)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
     if is_record(beginning):
         return _of_record(path)
     if beginning.startswith(_SQLITE) or path.suffix == ".sqlite":
@@ -109,7 +109,7 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
 
 
 def _readings_of_samples(plain: Mapping[str, Any], began: float) -> Readings:
@@ -149,7 +149,7 @@ def _of_journal(path: Path) -> Material:
                 stored = _records(copy)[:-1]  # the recovery adds an event of its own
                 notes = ("The journal is damaged: the report has its readable part.",)
         except OSError as error:
-            raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+            raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
         except JournalError as fault:
             raise JournalError(str(fault).replace(str(copy), str(path))) from None
     if len(stored) == _MOST_EVENTS:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from rosrm.errors import ConfigError
 from rosrm.runtime import atomic_file
+from rosrm.wording import reason_of
 from rosrm_report.extract import report_of
 from rosrm_report.model import Report
 from rosrm_report.page import page_of
@@ -34,4 +35,4 @@ def write_page(report: Report, output: Path) -> None:
     try:
         os.close(atomic_file.replace(str(output), page_of(report).encode()))
     except OSError as error:
-        raise ConfigError(f"--output {output}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"--output {output}: cannot be written: {reason_of(error)}") from None

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from rosrm.errors import ConfigError, RosrmError
+from rosrm.wording import reason_of
 from rosrm_simulate.meter import MEASURED
 from rosrm_simulate.runs import SimulationReport, SimulationRun
 
@@ -46,7 +47,7 @@ def draw(report: SimulationReport, path: Path) -> None:
     try:
         figure.savefig(path, dpi=110)
     except OSError as error:
-        raise RosrmError(f"--plot {path}: cannot be written: {error.strerror}") from None
+        raise RosrmError(f"--plot {path}: cannot be written: {reason_of(error)}") from None
 
 
 def _draw_usage(axis: Any, run: SimulationRun, resource: str) -> None:

@@ -28,6 +28,7 @@ from rosrm.extensions.units import Quantity
 from rosrm.recording.encoding import Happened
 from rosrm.recording.frames import is_record
 from rosrm.recording.reader import Recording, read_record
+from rosrm.wording import reason_of
 from rosrm_simulate.agreement import Agreement, compare
 from rosrm_simulate.engine import Progress, Simulation
 from rosrm_simulate.extraction import Extraction
@@ -141,7 +142,7 @@ def _holds_record(path: Path) -> bool:
         with path.open("rb") as file:
             beginning = file.read(_LONGEST_OPENING)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
     if is_record(beginning):
         return True
     if b"\0" in beginning:
@@ -201,7 +202,7 @@ def load_record(path: Path, *, cut: bool = False) -> Recording:
         with path.open("rb") as file:
             return read_record(file, str(path), cut=cut)
     except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
 
 
 def replay_record(

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import ConfigError
+from rosrm.wording import reason_of
 
 _OTHERS: Final = 0o077
 
@@ -16,7 +17,7 @@ def check_private(option: str, path: Path) -> None:
     try:
         state = path.stat()
     except OSError as error:
-        raise ConfigError(f"{option} {path}: cannot be read: {error.strerror}") from None
+        raise ConfigError(f"{option} {path}: cannot be read: {reason_of(error)}") from None
     if not stat.S_ISREG(state.st_mode):
         raise ConfigError(f"{option} {path}: a file is required")
     if stat.S_IMODE(state.st_mode) & _OTHERS:

@@ -18,6 +18,7 @@ import uvicorn
 
 from rosrm import clocks
 from rosrm.errors import ConfigError, NoMaster, Refused
+from rosrm.wording import reason_of
 from rosrm_web.access import Access
 from rosrm_web.app import create_app
 from rosrm_web.connections import MOST_CONNECTIONS, Connection
@@ -71,7 +72,7 @@ def open_socket(settings: Settings) -> socket.socket:
                 f"--listen: {where} is in use, perhaps by another `rosrm web`; give another port, "
                 f"such as --listen {settings.address}:{(settings.port + 1) % 65536}"
             ) from None
-        raise ConfigError(f"--listen: {where} cannot be used: {error.strerror}") from None
+        raise ConfigError(f"--listen: {where} cannot be used: {reason_of(error)}") from None
     return listener
 
 
@@ -136,7 +137,7 @@ class AcceptErrors:
             self._more += 1
             return
         more = f"; {self._more} more since the last line" if self._more else ""
-        _log.error("connections: cannot accept one: %s%s", error.strerror, more)
+        _log.error("connections: cannot accept one: %s%s", reason_of(error), more)
         self._logged, self._more = now, 0
 
 

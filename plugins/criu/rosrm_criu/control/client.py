@@ -15,6 +15,7 @@ from rosrm import clocks
 from rosrm.errors import PortableError
 from rosrm.runtime.signalling import send
 from rosrm.supervisor.procfs import read_environment
+from rosrm.wording import reason_of
 from rosrm_criu.control.directory import make
 from rosrm_criu.control.messages import (
     SIGNAL,
@@ -68,7 +69,7 @@ def make_control_root(uid: int) -> Path:
         try:
             make(root, uid)
         except OSError as error:
-            faults.append(f"{root}: {error.strerror}")
+            faults.append(f"{root}: {reason_of(error)}")
         except PortableError as error:
             faults.append(str(error))
         else:
@@ -129,7 +130,7 @@ def make_directory(directory: Path, uid: int | None = None) -> None:
         make(directory, owner)
     except OSError as error:
         raise PortableError(
-            f"the control directory {directory} cannot be made: {error.strerror}"
+            f"the control directory {directory} cannot be made: {reason_of(error)}"
         ) from None
     remove_messages(directory)  # requests follow only after the node has written a status
 
@@ -220,7 +221,7 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
     try:
         write_message(directory, request)
     except OSError as error:
-        raise PortableError(f"{directory} cannot be written: {error.strerror}") from None
+        raise PortableError(f"{directory} cannot be written: {reason_of(error)}") from None
     if pid is not None and (why := send(pid, SIGNAL)):
         raise PortableError(f"process {pid} cannot be woken: {why}")
 

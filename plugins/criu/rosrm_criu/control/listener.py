@@ -10,6 +10,7 @@ from typing import Final
 
 from rosrm import clocks
 from rosrm.errors import PortableError
+from rosrm.wording import reason_of
 from rosrm_criu.control.client import make_directory
 from rosrm_criu.control.directory import remove_directory
 from rosrm_criu.control.messages import (
@@ -79,7 +80,7 @@ class Listener:
         try:
             write_message(self._directory, status)
         except OSError as error:
-            self._log(f"{self._directory} cannot be written: {error.strerror}")
+            self._log(f"{self._directory} cannot be written: {reason_of(error)}")
 
     def enter(self, state: State, request: str = "") -> None:
         """Write the next state of a departure; its measured times are kept."""

@@ -22,6 +22,7 @@ from typing import Final, TypeVar
 
 from rosrm.errors import PortableError
 from rosrm.model.codec import from_plain, to_plain
+from rosrm.wording import reason_of
 from rosrm_criu.control.directory import opened
 
 #: Environment variable that names the control directory of a process.
@@ -122,7 +123,7 @@ def read_message(directory: Path, kind: type[_Content]) -> _Content | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        raise PortableError(f"{path} cannot be read: {error.strerror}") from None
+        raise PortableError(f"{path} cannot be read: {reason_of(error)}") from None
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):

@@ -23,7 +23,7 @@ from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm.runtime.log_tail import last_lines
 from rosrm.runtime.signalling import send_to_group
-from rosrm.wording import ending_of
+from rosrm.wording import ending_of, reason_of
 from rosrm_criu.engine.criu_log import causes, first_words
 
 #: Environment variable with the path of the program; if it is set, nothing else is searched.
@@ -98,7 +98,7 @@ class CriuBinary:
                     start_new_session=True,
                 )
             except OSError as error:
-                raise CriuError(f"CRIU cannot be started: {words[0]}: {error.strerror}") from None
+                raise CriuError(f"CRIU cannot be started: {words[0]}: {reason_of(error)}") from None
             code = _end_of(process, timeout)
             printed.seek(0)
             output = printed.read()
@@ -159,7 +159,7 @@ def opened(program: Path) -> CriuBinary:
             check=False,
         )
     except OSError as error:
-        why = error.strerror
+        why = reason_of(error)
         if isinstance(error, FileNotFoundError) and program.exists():
             why = "the C library that it names is missing; if CRIU was moved, install it again"
         raise CriuError(f"{program} cannot be started: {why}") from None

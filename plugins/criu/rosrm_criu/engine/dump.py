@@ -23,6 +23,7 @@ from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths, procfs
 from rosrm.supervisor.procfs import inner_pid
+from rosrm.wording import reason_of
 from rosrm_criu.engine import criu_log, external_resources, image, open_files, process_tree
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.image import Manifest
@@ -210,9 +211,9 @@ def _link(pid: int, name: str) -> str:
 
 def _explained(directory: Path, error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.ESRCH):
-        return f"it could not be looked at: {error.strerror}"
+        return f"it could not be looked at: {reason_of(error)}"
     if isinstance(error, OSError):
-        return f"the image in {directory} cannot be written: {error.strerror}"
+        return f"the image in {directory} cannot be written: {reason_of(error)}"
     return str(error)
 
 

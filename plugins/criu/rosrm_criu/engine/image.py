@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from rosrm.errors import CriuError
 from rosrm.model.codec import from_plain, to_plain
+from rosrm.wording import reason_of
 
 #: The format that is written. Only this one and its predecessor can be read.
 FORMAT: Final = 2
@@ -139,7 +140,7 @@ def create(directory: Path) -> None:
             raise CriuError(f"the image directory {directory} is not empty")
         (directory / PAGES).mkdir(mode=0o700)
     except OSError as error:
-        raise CriuError(f"no image can be made in {directory}: {error.strerror}") from None
+        raise CriuError(f"no image can be made in {directory}: {reason_of(error)}") from None
 
 
 def link_or_copy(source: str | Path, target: str | Path) -> None:
@@ -252,7 +253,7 @@ def _check_files(directory: Path, manifest: Manifest) -> None:
         try:
             found = _check_private(directory / name, stat.S_IFREG).st_size
         except OSError as error:
-            raise _damaged(directory, manifest, f"{name}: {error.strerror}") from None
+            raise _damaged(directory, manifest, f"{name}: {reason_of(error)}") from None
         if found != size:
             what = f"{name} has {found} bytes instead of {size}"
             raise _damaged(directory, manifest, what)
@@ -272,7 +273,7 @@ def check_contents(directory: Path, manifest: Manifest) -> None:
         try:
             found = _checksum_of_file(directory / name)
         except OSError as error:
-            raise _damaged(directory, manifest, f"{name}: {error.strerror}") from None
+            raise _damaged(directory, manifest, f"{name}: {reason_of(error)}") from None
         if found != checksum:
             sums = f"CRC-32 {found:08x} instead of {checksum:08x}"
             what = f"{name} has changed since it was written ({sums})"

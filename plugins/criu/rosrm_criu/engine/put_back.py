@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm.wording import reason_of
 from rosrm_criu.engine import image
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
 
@@ -85,7 +86,7 @@ def prepare(directory: Path, manifest: Manifest) -> None:
 def _why(error: OSError) -> str:
     if error.errno in (errno.ELOOP, errno.ENOTDIR):
         return "on its way is a symbolic link, which is not followed, or no directory"
-    return str(error.strerror)
+    return reason_of(error)
 
 
 def _put_back(directory: Path, held: HeldFile, working_directory: str) -> None:

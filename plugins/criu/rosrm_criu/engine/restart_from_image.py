@@ -21,6 +21,7 @@ if not __package__:
     sys.path += [str(Path(__file__).resolve().parents[2]), sys.argv.pop(1)]
 
 from rosrm.errors import CriuError, PortableError
+from rosrm.wording import reason_of
 from rosrm_criu.engine import paths, slots
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ def become(words: Sequence[str]) -> NoReturn:
     try:
         os.execvp(words[0], list(words))  # noqa: S606 - as the supervisor would start it
     except OSError as error:
-        sys.exit(f"{words[0]} cannot be started: {error.strerror}")
+        sys.exit(f"{words[0]} cannot be started: {reason_of(error)}")
 
 
 if __name__ == "__main__":

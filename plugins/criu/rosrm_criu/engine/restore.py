@@ -17,6 +17,7 @@ from typing import Final
 from rosrm.errors import CriuError
 from rosrm.supervisor import paths
 from rosrm.supervisor.procfs import SUPERVISOR_MARK
+from rosrm.wording import reason_of
 from rosrm_criu.engine import criu_log, image, relocation
 from rosrm_criu.engine.binary import CriuBinary
 from rosrm_criu.engine.dump import COMMON
@@ -77,7 +78,7 @@ def _check_file(file: HeldFile | MappedFile, here: str, holds: str) -> None:
     except OSError as error:
         raise CriuError(
             f"the file {file.path}, which the process {holds}, cannot be found on {here}: "
-            f"{error.strerror}"
+            f"{reason_of(error)}"
         ) from None
     if not stat.S_ISREG(status.st_mode):
         raise CriuError(f"{file.path}, which the process {holds}, is no file on {here}")

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm.wording import reason_of
 
 _REJOIN: Final = "rejoin.json"
 _STARTS: Final = "starts"
@@ -99,7 +100,7 @@ def _count_start(slot: Path) -> int:
             file.flush()
             return os.fstat(file.fileno()).st_size
     except OSError as error:
-        raise CriuError(f"the periodic image {slot} cannot be used: {error.strerror}") from None
+        raise CriuError(f"the periodic image {slot} cannot be used: {reason_of(error)}") from None
 
 
 def _slots(parent: Path) -> list[Path]:

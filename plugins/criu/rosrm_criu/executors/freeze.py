@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from rosrm.errors import CriuError
+from rosrm.wording import reason_of
 from rosrm_criu.control.client import (
     ask_prepare,
     ask_resume,
@@ -76,7 +77,7 @@ def control_of(pid: int) -> Path:
     try:
         found = directory_of(process_tree.root_of(pid))
     except OSError as error:
-        raise CriuError(f"process {pid} cannot be looked at: {error.strerror}") from None
+        raise CriuError(f"process {pid} cannot be looked at: {reason_of(error)}") from None
     if found is None:
         raise CriuError(
             f"process {pid} was not started to be moved by criu: restart it, with "

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from rosrm import clocks
 from rosrm.errors import CriuError, PortableError
+from rosrm.wording import reason_of
 from rosrm_criu.control.client import await_joined
 from rosrm_criu.engine import dump as dumping
 from rosrm_criu.engine import external_resources, image, paths, process_tree, slots
@@ -48,7 +49,7 @@ def why_not_written(parent: Path, error: OSError) -> str:
     """Explain a failed write; the images are missing if the process was restarted since."""
     if isinstance(error, FileNotFoundError) and not parent.exists():
         return "the process was restarted during the checkpoint, which removed its images"
-    return f"no image can be made in {parent}: {error.strerror}"
+    return f"no image can be made in {parent}: {reason_of(error)}"
 
 
 def _dump(asked: StepArguments, parent: Path) -> Mapping[str, Any]:

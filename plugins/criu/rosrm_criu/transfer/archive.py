@@ -18,6 +18,7 @@ from pathlib import Path, PurePosixPath
 from typing import Final
 
 from rosrm.errors import TransferError
+from rosrm.wording import reason_of
 from rosrm_criu.transfer.form import DIGEST_SIZE, new_digest
 
 if sys.version_info >= (3, 14):
@@ -154,7 +155,7 @@ def _entries(directory: Path, before: str) -> Iterator[_Entry]:
 def _unreadable(path: Path, error: OSError) -> str:
     if isinstance(error, FileNotFoundError):
         return f"{path} is gone, or was never there"
-    return f"{path} cannot be read: {error.strerror}"
+    return f"{path} cannot be read: {reason_of(error)}"
 
 
 # --- receiving --------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from typing import Final
 
 from rosrm.errors import TransferError
 from rosrm.runtime.disk_space import room_for
+from rosrm.wording import reason_of
 
 _PREFIX: Final = ".rosrm-fetch-"
 
@@ -48,7 +49,7 @@ class StagingDirectory:
                 self._lock = os.open(self.path, os.O_RDONLY | os.O_DIRECTORY)
                 fcntl.flock(self._lock, fcntl.LOCK_EX)
         except OSError as error:
-            raise TransferError(f"nothing can be made in {parent}: {error.strerror}") from None
+            raise TransferError(f"nothing can be made in {parent}: {reason_of(error)}") from None
 
     def require(self, size: int, reserve: int) -> None:
         """Raise `TransferError` unless `size` bytes fit and leave `reserve` bytes free."""
@@ -66,7 +67,7 @@ class StagingDirectory:
             self.path.rename(self._target)
         except OSError as error:
             raise TransferError(
-                f"{self._target} cannot be put in its place: {error.strerror}"
+                f"{self._target} cannot be put in its place: {reason_of(error)}"
             ) from None
 
     def close(self) -> None:

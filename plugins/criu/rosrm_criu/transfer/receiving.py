@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 from rosrm import clocks
 from rosrm.errors import TransferError
 from rosrm.runtime.disk_space import room_for
+from rosrm.wording import reason_of
 from rosrm_criu.transfer.addresses import nearest_first
 from rosrm_criu.transfer.archive import Unpacker
 from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Fetched, Offer
@@ -199,7 +200,7 @@ def _unpack(stream: _Stream, offer: Offer, directory: Path, target: Path) -> str
     except OSError as error:
         room = room_for(target)
         raise TransferError(
-            f"{target} cannot be written: {error.strerror}" + (f"; {room}" if room else "")
+            f"{target} cannot be written: {reason_of(error)}" + (f"; {room}" if room else "")
         ) from None
     except TransferError as error:
         if unpacker.position < offer.length:
@@ -224,6 +225,4 @@ def _cause(error: Exception) -> str:
         return "no answer in time"
     if isinstance(error, ssl.SSLError):
         return "the TLS connection broke"
-    return (
-        str(error.strerror).lower() if isinstance(error, OSError) and error.strerror else str(error)
-    )
+    return reason_of(error).lower() if isinstance(error, OSError) else str(error)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm import ConfigError, Notice, SkipPlugin
+from rosrm.wording import reason_of
 
 #: Topic of all notices.
 TOPIC: Final = "/rosrm/events"
@@ -71,7 +72,7 @@ class McapFile:
                 f"its own file"
             ) from None
         except OSError as fault:
-            raise ConfigError(f"{path} cannot be written: {fault.strerror}") from None
+            raise ConfigError(f"{path} cannot be written: {reason_of(fault)}") from None
         # A chunk for each message: a file that is cut short has all others.
         self._writer = Writer(self._stream, chunk_size=1)
         self._writer.start(profile="", library="rosrm")

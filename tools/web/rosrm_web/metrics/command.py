@@ -18,6 +18,7 @@ from rosrm.cli import connection
 from rosrm.cli.options import Domain, seconds_of
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.runtime import atomic_file
+from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
@@ -96,4 +97,4 @@ def _write(content: bytes, textfile: Path | None) -> None:
         # The new content is in *.new at first: the collector reads *.prom only.
         os.close(atomic_file.replace(str(textfile), content, mode=_READABLE))
     except OSError as error:
-        raise ConfigError(f"--textfile {textfile}: cannot be written: {error.strerror}") from None
+        raise ConfigError(f"--textfile {textfile}: cannot be written: {reason_of(error)}") from None
