@@ -163,3 +163,36 @@ def test_a_sink_that_hangs_is_named_once(outbox, caplog):
     delivery.close(10.0)
     (said,) = [one for one in caplog.messages if "has not returned" in one]
     assert said.startswith("sink odd: send has not returned for ")
+
+
+def test_a_notice_that_cannot_be_removed_is_not_sent_again(receiver, outbox, caplog, monkeypatch):
+    """The receiver has taken it; a full disk must not repeat it with each attempt."""
+    outbox.commit([("hook", notice(1)), ("hook", notice(2))], 2, {})
+    attempts, is_full, delivered = [], [True], outbox.delivered
+
+    def full(waiting):
+        if waiting:
+            attempts.append(waiting)
+        if waiting and is_full[0]:
+            raise OutboxError("notices cannot be removed: database or disk is full")
+        delivered(waiting)
+
+    monkeypatch.setattr(outbox, "delivered", full)
+    delivery = deliver(receiver, outbox)
+    wait_until(lambda: len(attempts) >= 3, "three attempts")
+    is_full[0] = False
+    wait_until(lambda: not outbox.waiting("hook", 1), "an empty outbox")
+    delivery.close(10.0)
+    assert [one["id"] for one in receiver.notices] == ["event-1", "event-2"]
+    assert "sink hook: notices cannot be removed: database or disk is full" in caplog.text
+
+
+def test_a_full_disk_is_an_error_of_the_outbox(outbox):
+    """Both the commit and the removal name the file."""
+    outbox.commit([("hook", notice(1))], 1, {})
+    outbox._file.execute(
+        "CREATE TRIGGER full BEFORE DELETE ON notices "
+        "BEGIN SELECT RAISE(ABORT, 'disk is full'); END"
+    )
+    with pytest.raises(OutboxError, match=r"outbox.sqlite: .* disk is full"):
+        outbox.delivered(outbox.waiting("hook", 1))

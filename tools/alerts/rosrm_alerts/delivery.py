@@ -11,7 +11,7 @@ from rosrm.errors import PluginError
 from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm.extensions.sinks import NoticesRefused
 from rosrm.wording import counted, duration
-from rosrm_alerts.outbox import Outbox
+from rosrm_alerts.outbox import Outbox, OutboxError, Waiting
 
 #: Seconds before the first retry, and the most between two retries; each wait doubles.
 FIRST_RETRY: Final = 1.0
@@ -38,6 +38,7 @@ class Delivery:
         self._name, self._sink, self._outbox, self._batch = name, sink, outbox, batch
         self._first_retry, self._patience = first_retry, patience
         self._sending_since: float | None = None
+        self._sent: list[Waiting] = []  # taken by the sink, and still stored
         self._wake, self._stop = threading.Event(), threading.Event()
         # A daemon, because a sink that hangs must not keep the process alive.
         self._thread = threads.start(self._run, f"sink {name}", again=True)
@@ -82,7 +83,7 @@ class Delivery:
 
     def _deliver(self) -> bool:
         """Deliver all that waits; return False if an attempt failed."""
-        while waiting := self._outbox.waiting(self._name, self._batch):
+        while self._remove_sent() and (waiting := self._outbox.waiting(self._name, self._batch)):
             notices = [one.notice for one in waiting]
             self._sending_since = clocks.boot_time()
             try:
@@ -95,5 +96,16 @@ class Delivery:
                 return False
             finally:
                 self._sending_since = None
-            self._outbox.delivered(waiting)
+            self._sent = waiting
+        return not self._sent
+
+    def _remove_sent(self) -> bool:
+        """Remove the notices that the sink has taken; without that, none is sent again."""
+        try:
+            if self._sent:
+                self._outbox.delivered(self._sent)
+        except OutboxError as fault:
+            _log.warning("sink %s: %s", self._name, fault)
+            return False
+        self._sent = []
         return True

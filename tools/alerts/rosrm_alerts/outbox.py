@@ -118,11 +118,14 @@ class Outbox:
         return [Waiting(number, Notice(**json.loads(notice))) for number, notice in rows]
 
     def delivered(self, waiting: Sequence[Waiting]) -> None:
-        """Remove notices."""
-        with self._lock, self._file:
-            self._file.executemany(
-                "DELETE FROM notices WHERE number = ?", [(one.number,) for one in waiting]
-            )
+        """Remove notices. Raises OutboxError."""
+        try:
+            with self._lock, self._file:
+                self._file.executemany(
+                    "DELETE FROM notices WHERE number = ?", [(one.number,) for one in waiting]
+                )
+        except sqlite3.Error as fault:
+            raise OutboxError(f"{self._path}: notices cannot be removed: {fault}") from fault
 
     def close(self) -> None:
         """Close the file."""

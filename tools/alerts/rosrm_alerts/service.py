@@ -36,7 +36,7 @@ from rosrm_alerts.conditions import (
 )
 from rosrm_alerts.delivery import Delivery
 from rosrm_alerts.file_forms import Forwarded
-from rosrm_alerts.outbox import Outbox
+from rosrm_alerts.outbox import Outbox, OutboxError
 from rosrm_alerts.watch import Change, Watch
 
 #: Seconds between two listings of the cluster.
@@ -45,6 +45,9 @@ PERIOD: Final = 1.0
 CLOSING: Final = 5.0
 #: Most events in one listing; a longer absence leaves out the oldest.
 _MOST_EVENTS: Final = 10_000
+
+#: Most notices that wait in memory for the disk.
+MOST_UNSTORED: Final = 10_000
 
 _log = logging.getLogger("rosrm.alerts")
 
@@ -70,6 +73,8 @@ class AlertService:
         self._is_first = position is None
         self._client: Client | None = None
         self._answers = True
+        self._unstored: list[tuple[str, Notice]] = []
+        self._trouble = ""  # why the last notices could not be stored
         self._deliveries = {
             name: Delivery(name, sink, outbox, batch) for name, (sink, batch) in sinks.items()
         }
@@ -101,12 +106,26 @@ class AlertService:
             *_forwarded(self._file.forwarded, events),
             *((sink, notice_of_change(one)) for one in changes for sink in one.alert.to),
         ]
-        if notices or changes or events:
-            dropped = self._outbox.commit(notices, self._feed.after, self._watch.active)
-            if dropped:
-                _log.error("%d notices were dropped: too many wait for a sink", dropped)
-        for sink in {sink for sink, _ in notices}:
-            self._deliveries[sink].notify()
+        self._unstored += notices
+        if notices or changes or events or self._trouble:
+            self._store()
+
+    def _store(self) -> None:
+        """Store the notices; where the disk takes none, they wait here for the next look."""
+        try:
+            dropped = self._outbox.commit(self._unstored, self._feed.after, self._watch.active)
+        except OutboxError as error:
+            if str(error) != self._trouble:
+                _log.error("%s; the next attempt is in %g s", error, PERIOD)
+            self._trouble = str(error)
+            dropped = max(0, len(self._unstored) - MOST_UNSTORED)
+            del self._unstored[:dropped]
+        else:
+            stored, self._unstored, self._trouble = self._unstored, [], ""
+            for sink in {sink for sink, _ in stored}:
+                self._deliveries[sink].notify()
+        if dropped:
+            _log.error("%d notices were dropped: too many wait", dropped)
 
     def _list(self, after: int, newest: int) -> Listing:
         """Ask for the listing of the cluster, with its events after a sequence."""

@@ -8,6 +8,7 @@ import pytest
 
 from rosrm import NoMaster, Refused
 from rosrm_alerts.conditions import Alert, NoAnswer
+from rosrm_alerts.outbox import OutboxError
 from rosrm_alerts.service import AlertService
 
 
@@ -76,3 +77,33 @@ def test_a_clock_that_is_set_neither_begins_nor_delays_an_alert(monkeypatch, cap
         wall[0] = 1.7e9 + step + (3600.0 if step % 2 else -3600.0)
         service._look()
         assert bool(begun) is (step >= 30), step
+
+
+def test_a_full_disk_of_the_outbox_does_not_end_the_watch(monkeypatch, caplog) -> None:
+    """The notices wait in memory, and are stored with the position once there is room."""
+    boot, stored, is_full = [1000.0], [], [True]
+    monkeypatch.setattr("rosrm.clocks.boot_time", lambda: boot[0])
+
+    class FullOutbox(Outbox):
+        def commit(self, notices, *_):
+            if is_full[0]:
+                raise OutboxError("notices cannot be stored: database or disk is full")
+            stored.extend(notices)
+            return 0
+
+    def connect():
+        raise NoMaster("no master answers")
+
+    told = []
+    file = SimpleNamespace(
+        alerts=[Alert("silent", NoAnswer(), to=("hook",), lasts=3.0)], forwarded=()
+    )
+    service = AlertService(file, {}, FullOutbox(), connect)
+    service._deliveries["hook"] = SimpleNamespace(notify=lambda: told.append(len(stored)))
+    for step in range(8):
+        is_full[0] = step < 6
+        boot[0] += 1.0
+        service._look()
+    assert [(sink, notice.alert) for sink, notice in stored] == [("hook", "silent")]
+    assert told == [1]
+    assert caplog.text.count("database or disk is full") == 1
