@@ -58,6 +58,7 @@ class PathCall:
 
     Attributes:
         has_ended: no thread executes it any more, or will.
+        ended_late: called in the loop at the end of a call that has failed as late.
     """
 
     def __init__(
@@ -71,6 +72,7 @@ class PathCall:
         self.began = 0.0
         self.is_over = False
         self.has_ended = False
+        self.ended_late: Callable[[], None] = lambda: None
 
     def reach(self, path: str) -> None:
         """Note the path; raise `NoAnswer` if it is on a file system with a late call."""
@@ -174,7 +176,7 @@ class PathCalls:
 
     def _finish(self, call: PathCall, outcome: Callable[[], None]) -> None:
         """Return an outcome to the loop, in the thread of the call."""
-        self._post(lambda: None if call.is_over else outcome())
+        self._post(lambda: call.ended_late() if call.is_over else outcome())
 
 
 class RunPath(Protocol):
@@ -226,6 +228,7 @@ class NewestWrite(Generic[T]):
         if self._values and (self._call is None or self._call.has_ended):
             write = partial(self._write, self._values.pop())
             self._call = self._run(write, self._continue, self._continue)
+            self._call.ended_late = self._begin
 
     def _continue(self, _: object) -> None:
         self._begin()

@@ -111,3 +111,23 @@ def test_mounts_of_other_machines_are_told_by_their_type(tmp_path):
     """Local file systems answer each path for itself."""
     assert path_calls._remote_mount(str(tmp_path)) == ""
     assert path_calls._remote_mount("/proc/self") == ""
+
+
+def test_the_newest_value_is_written_when_a_late_path_answers(loop):
+    """No later value has to follow; a value in between is left out."""
+    written: list[str] = []
+
+    def write(value: str) -> None:
+        written.append(loop._work(value, waits=value == "first"))
+
+    writes = path_calls.NewestWrite(loop.calls.run, write)
+    writes.put("first")
+    assert loop.waiting.acquire(timeout=PATIENCE)
+    loop.pass_time(path_calls.LATE * 2)
+    loop.pass_time(path_calls.PATIENCE)
+    writes.put("second")
+    writes.put("third")
+    loop.answer.set()
+    loop.turn()
+    loop.turn()
+    assert written == ["first", "third"]
