@@ -151,6 +151,7 @@ def parts(lab: Lab, folder: Path) -> Iterator[None]:
     finally:
         for part in started:
             part.kill()
+        for part in started:  # one that cannot end keeps no other alive
             part.wait(_END)
 
 

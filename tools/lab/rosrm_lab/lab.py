@@ -96,8 +96,8 @@ class Lab:
                     record = LabRecord(plan, boot=boot_id(), owner=owner)
                     store.write(record)
                 making.make(self._hierarchies, record, between)
-            except BaseException:  # a signal raises one, too, and no part of the lab may stay
-                _to_the_end(lambda: making.remove(self._hierarchies, self.name))
+            except BaseException as first:  # a signal raises one, too; no part may stay
+                _undo(first, lambda: making.remove(self._hierarchies, self.name))
                 raise
 
     def down(self) -> bool:
@@ -368,6 +368,21 @@ class Lab:
             after = before.changed(direction, **values)
             making.change_link(record, host, before, after)
             store.write(record)
+
+
+def _undo(first: BaseException, remove: Callable[[], object]) -> None:
+    """Remove a lab that could not be made.
+
+    Raises:
+        LabError: it cannot be removed either; the text has both reasons.
+    """
+    try:
+        _to_the_end(remove)
+    except (LabError, OSError, subprocess.SubprocessError) as fault:
+        raise LabError(
+            f"{str(first) or type(first).__name__}; then the lab could not be removed: {fault}. "
+            "`rosrm lab down` tries again"
+        ) from first
 
 
 def _to_the_end(remove: Callable[[], object]) -> None:
