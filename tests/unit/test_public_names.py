@@ -42,10 +42,14 @@ OF_CRIU = {
     "rosrm.ros.graph_remains",
     "rosrm.ros.names",
     "rosrm.ros.peer_announcements",
+    "rosrm.runtime",
     "rosrm.runtime.disk_space",
+    "rosrm.runtime.log_tail",
+    "rosrm.runtime.signalling",
     "rosrm.supervisor",
     "rosrm.supervisor.procfs",
     "rosrm.supervisor.spawn",
+    "rosrm.supervisor.spawn_error",
     "rosrm.wording",
 }
 PAGES = [
