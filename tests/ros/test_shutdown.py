@@ -83,9 +83,9 @@ def test_logs_of_parts_that_are_stopped_together(cluster) -> None:
 
     The slave can only handle the second signal after it has begun to stop.
     """
-    deaf = "trap '' INT TERM; while :; do sleep 0.1; done"
+    deaf = "trap '' INT TERM; echo deaf; while :; do sleep 0.1; done"
     cluster.submit(service("deaf", "sh", "-c", deaf, stop=StopPolicy(3.0, 3.0)))
-    cluster.wait("deaf", "running")
+    cluster.wait_for_log("deaf", "deaf")
     master, slave = cluster.master, cluster.slaves["h0"]
     written = {part.name: len(cluster.log_of(part.name)) for part in (master, slave)}
 
