@@ -20,9 +20,16 @@ from rosrm.core.master.commands import Assign, OrderId, Redeliver, SendOrder, Wi
 from rosrm.errors import Refused
 from rosrm.keys.security import Authority, Peer
 from rosrm.model.links import LinkPeer
-from rosrm.model.orders import MeasureLinks, Order, StartInstance, seconds_of
+from rosrm.model.orders import (
+    FenceInstance,
+    MeasureLinks,
+    Order,
+    StartInstance,
+    StopInstance,
+    seconds_of,
+)
 from rosrm.model.traced_values import stamped_assignment
-from rosrm.model.values import Assignment, HostDescription
+from rosrm.model.values import Assignment, HostDescription, InstanceId
 from rosrm.ros import convert, names
 from rosrm.ros.control import ControlClient, accepted, version_refusal
 from rosrm.ros.master.reading_stats import ReadingStats
@@ -52,11 +59,13 @@ class _Deferred:
         deadline: monotonic seconds.
         send: carries it out.
         done: called with None when the deadline has passed.
+        starts: the instance that it starts; None: it starts none.
     """
 
     deadline: float
     send: Callable[[], None]
     done: Callable[[None], None] = lambda _: None
+    starts: InstanceId | None = None
 
 
 @dataclass(slots=True)
@@ -104,6 +113,13 @@ class HostLink:
         self.deferred = [one for one in self.deferred if now < one.deadline]
         self.introductions = [one for one in self.introductions if now < one.deadline]
         return late
+
+    def drop_start(self, instance: InstanceId) -> None:
+        """Drop a waiting start of an instance that is stopped now; otherwise it would run first."""
+        dropped = [one for one in self.deferred if one.starts == instance]
+        self.deferred = [one for one in self.deferred if one.starts != instance]
+        for one in dropped:
+            one.done(None)
 
     def search(self) -> None:
         """Require that DDS discovers the slave's service before the next order."""
@@ -252,7 +268,7 @@ class HostLinks:
 
     def after_first_reading(
         self, link: HostLink, send: Callable[[], None], deadline: float = math.inf,
-        done: Callable[[None], None] = lambda _: None,
+        done: Callable[[None], None] = lambda _: None, starts: InstanceId | None = None,
     ) -> None:  # fmt: skip
         """Call `send` now, or when the first beat of the slave has come, after what waits already.
 
@@ -261,7 +277,7 @@ class HostLinks:
         if self.reading_stats.beat[link.host_id] and not link.deferred:
             send()
         else:
-            self._wait(link, _Deferred(deadline, send, done))
+            self._wait(link, _Deferred(deadline, send, done, starts))
 
     def introduce_after_first_reading(
         self, link: HostLink, send: Callable[[], None], deadline: float,
@@ -377,7 +393,12 @@ class HostLinks:
             why = "the host does not report"
             self._handle(happened.OrderAnswered.missing(command.order_id, why))
             return
-        request = order_to_msg(self._order_with_key(command.order, link))
+        order, starts = command.order, None
+        if isinstance(order, StartInstance):
+            starts = order.assignment.instance
+        elif isinstance(order, StopInstance | FenceInstance):
+            link.drop_start(order.instance)
+        request = order_to_msg(self._order_with_key(order, link))
         deadline = now + seconds_of(command.order) + self._order_timeout
 
         def done(response: srv.ControlHost.Response | None) -> None:
@@ -385,11 +406,11 @@ class HostLinks:
 
         def send() -> None:
             if link.deferred or not self._is_discovered(link):  # in the order of the decisions
-                self._wait(link, _Deferred(deadline, send, done))
+                self._wait(link, _Deferred(deadline, send, done, starts))
                 return
             self._send(link, request, deadline, done)
 
-        self.after_first_reading(link, send, deadline, done)
+        self.after_first_reading(link, send, deadline, done, starts)
 
     def _send(
         self, link: HostLink, request: srv.ControlHost.Request, deadline: float,

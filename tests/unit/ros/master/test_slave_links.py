@@ -13,7 +13,13 @@ from rosrm.core.master.commands import Assign, SendOrder
 from rosrm.core.master.events import BAD_RESULT
 from rosrm.keys.cluster import ClusterSecret
 from rosrm.keys.security import MasterSecurity
-from rosrm.model.orders import ReloadSettings, ReportInstances, StartInstance
+from rosrm.model.orders import (
+    FenceInstance,
+    ReloadSettings,
+    ReportInstances,
+    StartInstance,
+    StopInstance,
+)
 from rosrm.model.values import Assignment, HostDescription, InstanceId, ProcessSpec
 from rosrm.ros.control import accepted
 from rosrm.ros.master.reading_decoder import Runs
@@ -106,6 +112,19 @@ def test_an_order_does_not_overtake_one_that_waits_for_discovery(links, control)
     receive_reading(links, beat=200, sequence=2)
     sent = [request.order for request in links._client.requests]
     assert sent == [ReportInstances(), ReloadSettings()]
+
+
+@pytest.mark.parametrize("end", [StopInstance, FenceInstance])
+def test_a_stop_replaces_the_start_that_waits(links, end):
+    """Otherwise a job that is withdrawn from a silent slave begins there, and again elsewhere."""
+    links.renew(HOST, DESCRIPTION, SLAVE, SLAVE_RUN)
+    one, other = assignment("one", 0), assignment("other", 0)
+    for number, started in enumerate((one, other)):
+        links.order(SendOrder(number, HOST, StartInstance(started)), now=0.0)
+    links.order(SendOrder(2, HOST, end(one.instance)), now=0.0)
+    receive_reading(links, beat=100, sequence=1)
+    sent = [request.order for request in links._client.requests]
+    assert sent == [StartInstance(other), end(one.instance)]
 
 
 def test_discovery_is_asked_once_for_each_registration(links, control):
