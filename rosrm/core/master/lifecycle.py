@@ -211,7 +211,8 @@ def _note_restarts(
             failover.note_restart(state, process)
     if process.restarts != status.restarts:
         process.phase_before_loss = None  # restarted while its host was silent
-        note_run(process, status)  # of the run before the restart
+        if not status.pid:  # that of a run counts the time since the first one
+            note_run(process, status)
     process.restarts = status.restarts
 
 
