@@ -190,9 +190,8 @@ class Starter:
         return True
 
     def close(self) -> None:
-        """Start no further instances."""
+        """Start no further instances; those whose orders are being made have not begun."""
         self._closed = True
-        self._launching.clear()
 
     def has_begun(self, instance: InstanceId) -> bool:
         """Return True if the supervisor has or had the instance."""
@@ -282,7 +281,11 @@ class Starter:
         """Send what has been made; make the orders behind a late one in another thread."""
         made, left = orders.take()
         self._send(made, slots)
-        wanted = [one for one in left if self._launching.get(one.instance) is one]
+        wanted = (
+            []
+            if self._closed
+            else [one for one in left if self._launching.get(one.instance) is one]
+        )
         if wanted:
             self._start(wanted, slots)
 
@@ -304,7 +307,8 @@ class Starter:
         orders = []
         for assignment, order in made:
             instance = assignment.instance
-            if self._launching.get(instance) is not assignment or instance not in self.state.held:
+            is_due = self._launching.get(instance) is assignment and not self._closed
+            if not is_due or instance not in self.state.held:
                 continue
             if isinstance(order, Launch):
                 ask = partial(order_of, order, self.launchers, self.config.host)
@@ -331,7 +335,7 @@ class Starter:
     ) -> None:
         """Start an instance whose launcher has answered, or refuse it."""
         instance = assignment.instance
-        if instance not in self._launching:  # it was stopped
+        if self._closed or instance not in self._launching:  # it was stopped
             return
         del self._launching[instance]
         if isinstance(outcome, LaunchOrder):

@@ -192,3 +192,12 @@ def test_a_file_operation_without_a_thread_fails(monkeypatch):
 def no_thread(_) -> None:
     """Fail as where the limit of the processes is reached."""
     raise RuntimeError("can't start new thread")
+
+
+def test_a_start_whose_order_is_made_at_the_end_of_the_slave_has_not_begun(slave):
+    """Otherwise the slave would say at its end that the process may still run."""
+    slave.launch(ProcessSpec("late", command=("true",)))
+    slave.starter.close()
+    slave.posted.get(timeout=PATIENCE)()
+    assert slave.started == []
+    assert not slave.starter.has_begun(InstanceId("late", 1))
