@@ -248,7 +248,7 @@ class SupervisorLink:
 
         If none can be started, try again with back-off: the slave stays, and reports its instances.
         """
-        logged, tries = False, 0
+        logged, pauses = False, threads.Pauses()
         while True:
             try:
                 client = SupervisorClient.connect(self.state, log=self._limits, timeout=_PATIENCE)
@@ -261,8 +261,7 @@ class SupervisorLink:
             except SupervisorError as error:
                 if self._leaves.is_set():
                     raise
-                pause = min(2.0**tries, _LONGEST_PAUSE)
-                tries += pause < _LONGEST_PAUSE
+                pause = pauses.after_fault()
                 self._note_absence(str(error), pause)
                 self._leaves.wait(pause)
             else:
