@@ -4,9 +4,10 @@ Durations, deadlines, leases and fences need a clock that is never set and never
 boot clock is both: NTP sets the clock of the day, and `time.monotonic` stops while the
 machine is suspended. All times of a part are of the boot clock, so that two can be compared.
 
-What others do meanwhile counts the time of a suspend. What this machine has to do in a time does
-not, because it does nothing while it is suspended: a core leaves out the seconds that `Suspends`
-finds (its event `Slept`), and a wait that is compared with no other time uses `awake_time`.
+A time after which others act counts the time of a suspend. A time in which this machine has to do
+something does not, because it does nothing while it is suspended: a core leaves out the seconds
+that `Suspends` finds (its event `Slept`), and a wait that is compared with no other time uses
+`awake_time`.
 
 ====================================================================  ======================
 of a slave and its supervisor                                         counts

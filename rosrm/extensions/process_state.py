@@ -34,7 +34,7 @@ _OF_LIBRARIES: Final = (signal.SIGINT, signal.SIGTERM)
 
 
 #: Contents of `os.environ`. A copy is one step, which no thread of a plugin can divide; a copy of
-#: `os.environ` itself fails with `KeyError` if a thread removes a variable meanwhile.
+#: `os.environ` itself fails with `KeyError` if a thread removes a variable during it.
 _VARIABLES: Final[dict[bytes, bytes]] = vars(os.environb)["_data"]
 #: Most environment variables in a warning, and most letters of each.
 _NAMED: Final = 3

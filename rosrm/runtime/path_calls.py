@@ -192,7 +192,7 @@ class RunPath(Protocol):
 def run_at_once(
     work: Callable[[], Any], then: Callable[[Any], None], failed: Callable[[Exception], None]
 ) -> PathCall:
-    """Call `work` at once, where no loop has to go on."""
+    """Call `work` in this thread, for a caller without a loop; see `PathCalls.run`."""
     call = PathCall(work, then, failed, lambda: None, list)
     call.has_ended = True
     try:

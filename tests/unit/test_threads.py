@@ -40,7 +40,7 @@ def test_a_loop_runs_again_after_a_fault(caplog):
 
 
 def test_the_owner_learns_the_fault(caplog):
-    """What others wait for ends with its reason."""
+    """Work that others wait for ends with its reason."""
     faults = []
     threads.start(lambda: 1 / 0, "start", failed=faults.append).join(PATIENCE)
     assert isinstance(faults[0], ZeroDivisionError)

@@ -59,7 +59,7 @@ def test_what_runs_is_watched_cancelled_and_recorded_later(host, hung):
 
 
 def test_a_start_fails_with_the_reason_and_another_one_at_once(host, hung):
-    """The process that a user cancels meanwhile ends at once."""
+    """A process that a user cancels before that ends at once."""
     client = host.connect()
     host.sleeper(client, "runs")
     hung.hang()

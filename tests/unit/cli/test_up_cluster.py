@@ -34,7 +34,7 @@ def test_the_error_of_an_ended_part_says_how_it_ended(tmp_path, returncode, how)
 
 def test_a_log_that_cannot_be_read_hides_no_ended_part(tmp_path):
     """The error says that the part has ended, and why the log has no lines."""
-    error = cluster._error_of(part(tmp_path, 1))  # a directory, which nobody can read as a file
+    error = cluster._error_of(part(tmp_path, 1))  # a directory, whose bytes cannot be read
     assert isinstance(error, PartEnded)
     assert "has ended (exit code 1)" in str(error)
     assert "Is a directory" in str(error)

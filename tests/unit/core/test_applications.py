@@ -558,7 +558,7 @@ def test_a_version_that_fails_is_given_up() -> None:
 
 
 def test_a_return_starts_no_process_that_was_cancelled_since() -> None:
-    """It starts one that the failed version did not have."""
+    """The return starts a process that the failed version did not have."""
     cluster = Cluster("a")
     cluster.apply("nav", process("p"), process("q"), process("r"))
     cluster.wait(1.0)

@@ -1154,7 +1154,7 @@ TestPlay = pytest.mark.timeout(300)(Play.TestCase)  # 60 s alone, more beside ot
 
 
 def test_a_source_that_was_given_up_owns_no_name_after_its_move_is_undone() -> None:
-    """It returned with its host during the undo, and was being stopped: it is no owner any more."""
+    """The source returned with its host during the undo, and was being stopped: it owns nothing."""
     play = Play()
     play.begin(
         backfill=False, most=1, slots=0, first="handoff, standby", second="handoff, standby",

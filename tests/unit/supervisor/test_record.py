@@ -239,7 +239,7 @@ def test_a_compaction_without_room_leaves_no_part_of_itself(tmp_path, core, reco
 
 @pytest.fixture
 def stuck():
-    """Return a thread whose calls wait, and a function that lets them go on."""
+    """Return a thread whose calls wait, and a function that ends the wait."""
     disk, gate = FileThread("the state directory", patience=0.1), threading.Event()
 
     def hang() -> None:

@@ -11,7 +11,7 @@ from rosrm.supervisor.send_buffer import Outgoing
 
 
 def test_without_a_thread_the_peer_counts_as_gone(monkeypatch):
-    """Nothing would send what waits, and each order would be queued in vain."""
+    """Otherwise each order would be queued, and no thread would send it."""
 
     def none(*_, **__):
         raise RuntimeError("can't start new thread")

@@ -833,7 +833,7 @@ def test_a_suspend_delays_no_restart():
 
 
 def test_a_bug_in_a_part_of_the_loop_does_not_end_the_parent_of_all_processes(monkeypatch):
-    """The other parts go on, and the supervisor's own log has the traceback."""
+    """The other parts are called, and the supervisor's own log has the traceback."""
     notes = []
     monkeypatch.setattr(server.own_log, "write_fault", notes.append)
     monkeypatch.setattr(server, "PAUSE_AFTER_FAULT", 0.0)

@@ -43,7 +43,7 @@ class Sink:
 
 
 def test_a_disk_that_fails_for_a_while_ends_no_delivery(monkeypatch):
-    """Otherwise the sink would get nothing any more, and nobody would be told."""
+    """Otherwise the sink would get no further notice, without a message."""
     monkeypatch.setattr(threads, "FIRST_PAUSE", 0.01)
     sink = Sink()
     delivery = Delivery("a", GuardedSink("a", sink), Outbox())
