@@ -61,12 +61,12 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
             RuntimeError: another node of this process is migratable already.
         """
         other = _NODES.get(identity.instance)
-        _NODES[identity.instance] = self
         if other is not None and other.context.ok():
             raise RuntimeError(
                 f"rosrm moves a process by one node, and {other.get_name()!r} is it already: make "
                 f"the others of this process rclpy's nodes, or run each in a process of its own"
             )
+        _NODES[identity.instance] = self
 
     # --- for authors -----------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import time
 import zlib
 
@@ -15,6 +16,7 @@ from std_srvs.srv import Trigger
 
 from rosrm.node import Node
 from rosrm.node.managed_node import Mode
+from rosrm.node.migratable import _NODES
 from rosrm.node.snapshots.marks import POSITIONS
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, encoded_head
@@ -214,6 +216,37 @@ def test_a_snapshot_that_would_fail_later_is_not_restored(stage, tmp_path, count
     stage.instance(counter, 2, keep=tmp_path)
     with pytest.raises(Exception, match=text):
         stage.spin_until(lambda: False, "an error")
+
+
+def test_a_state_without_a_cycle_is_not_kept(stage, tmp_path, counter):
+    """The next start has it from the constructor; here the constructor may have failed halfway."""
+    stage.remove(stage.instance(counter, 1, keep=tmp_path))
+    assert reader.newest_head(tmp_path) is None
+
+
+class Unready(Node):
+    """A node whose constructor raises before it has named its state."""
+
+    def __init__(self, **named) -> None:
+        super().__init__("counter", **named)
+        raise OSError("no camera yet")
+
+
+def test_a_node_that_cannot_be_made_is_freed(stage, tmp_path):
+    """In a container, each attempt would leave one more node in the graph."""
+    for _ in range(3):
+        with pytest.raises(OSError, match="no camera yet"):
+            stage.instance(Unready, 1, keep=tmp_path)
+        gc.collect()
+        assert not _NODES
+
+
+def test_a_second_migratable_node_is_refused_each_time(stage, tmp_path):
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    for _ in range(2):
+        with pytest.raises(RuntimeError, match="'counter' is it already"):
+            stage.instance(Counter, 1, keep=tmp_path)
+    assert _NODES[1] is first
 
 
 class Slow(Counter):

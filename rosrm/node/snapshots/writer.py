@@ -48,7 +48,7 @@ class SnapshotSaver:
         self._run = run
         self._every = entities.identity.keep_every
         self._next = 0.0
-        self._kept = -1
+        self._kept = 0  # without a cycle there is nothing to keep: the constructor may have failed
         self._closed = False
         self._due: list[int] = []
         self._publishers: dict[str, int] = {}
@@ -58,8 +58,8 @@ class SnapshotSaver:
             entities.plain, max(self._every, 1e-3), self._keep_late, autostart=False
         )
         self._armed = False
-        atexit.register(self.close)
         if entities.sequence:  # the state came from another instance, so this one has no file of it
+            atexit.register(self.close)
             self._arm()
 
     def after_cycle(self) -> None:
@@ -88,6 +88,8 @@ class SnapshotSaver:
         return new and entities.mode is Mode.ACTIVE and not entities.in_cycle
 
     def _keep(self, now: float) -> None:
+        if not self._next:  # not earlier: it would hold a node whose constructor raises for ever
+            atexit.register(self.close)
         try:
             blocks = self._blocks()
         except StateError as error:
@@ -147,7 +149,6 @@ class SnapshotSaver:
         if self._closed:
             return
         self._closed = True
-        atexit.unregister(self.close)
         # The wait is limited, because another thread of the executor may be stuck in a callback.
         if self._entities.turn.acquire(timeout=_CLOSE_PATIENCE):
             try:
@@ -156,6 +157,7 @@ class SnapshotSaver:
             finally:
                 self._entities.turn.release()
         self._writer.close()
+        atexit.unregister(self.close)
 
 
 class _Writer:

@@ -51,7 +51,7 @@ void SnapshotSaver::keep_late()
 /// Return true if the state is new, and lies between two cycles of an active node.
 bool SnapshotSaver::may_keep() const
 {
-  const bool is_new = !kept_ || *kept_ != entities_.sequence;
+  const bool is_new = kept_ != entities_.sequence;
   return is_new && entities_.mode == Mode::kActive && !entities_.in_cycle;
 }
 

@@ -40,7 +40,8 @@ private:
   std::uint64_t run_;
   std::optional<SnapshotWriter> writer_;
   double next_ = 0.0;
-  std::optional<std::uint64_t> kept_;
+  /// Without a cycle there is nothing to keep: the author's constructor may still run.
+  std::uint64_t kept_ = 0;
   int alarm_ = 0;
   /// Closed, or a newer instance writes in the directory.
   bool is_over_ = false;
