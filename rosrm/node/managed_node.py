@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import itertools
 import threading
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from enum import Enum
+from functools import partial
 from typing import Any, Final
 
 from rclpy.executors import MultiThreadedExecutor
@@ -92,6 +94,8 @@ class NodeEntities:
         self._openings: list[ServiceOf | OpeningOf] = []
         #: `timers_due` of a node that is active, but whose timers have not started yet.
         self._due_at_start: Sequence[int] | None = None
+        #: Further work of a node that has become active.
+        self._steps: deque[Callable[[], None]] = deque()
         self._replay = InputReplay(plain, self.turn, self._serve_next)
         self.buffer = self._new_buffer()
 
@@ -409,30 +413,27 @@ class NodeEntities:
         self._late_until = clocks.boot_time() + _LATE
         self._due_at_start = timers_due
         announce()
-        self._replay.begin(self._start(timers_due, since, settle))
+        opens = (partial(self._open, one) for one in self._openings)
+        self._steps = deque([partial(self._start_timers, timers_due, since), *opens, *settle])
+        self._replay.begin(self._next_step)
 
-    def _start(
-        self, timers_due: Sequence[int], since: float, settle: Sequence[Callable[[], None]]
-    ) -> Iterator[None]:
-        """Start timers and services in steps of some ms; new messages are served between steps."""
-        if not self._is_active():
-            return
-        self._start_timers(timers_due, clocks.boot_time() - since)
+    def _next_step(self) -> bool:
+        """Do the next step of some ms, between new messages; return False if there is none.
+
+        A step of the author may raise, and the executor may go on: the others follow.
+        """
+        if self.mode is not Mode.ACTIVE or not self._steps:
+            return False
+        self._steps.popleft()()
+        return True
+
+    def _open(self, opening: ServiceOf | OpeningOf) -> None:
+        if opening in self._openings:
+            opening.open()
+
+    def _start_timers(self, timers_due: Sequence[int], since: float) -> None:
+        passed = clocks.boot_time() - since
         self._due_at_start = None
-        for opening in list(self._openings):
-            yield
-            if not self._is_active():
-                return
-            if opening in self._openings:
-                opening.open()
-        for call in settle:
-            yield
-            call()
-
-    def _is_active(self) -> bool:
-        return self.mode is Mode.ACTIVE
-
-    def _start_timers(self, timers_due: Sequence[int], passed: float) -> None:
         for timer, due in itertools.zip_longest(list(self.timers), timers_due):
             if timer is None:
                 return

@@ -442,6 +442,30 @@ def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(s
     assert made[1:] == [("destroyed", "counter"), ("made", ALIAS)]
 
 
+def test_a_successor_whose_opening_fails_can_be_moved(stage):
+    """The author may catch the error; the other openings and the role of a source follow."""
+    made = []
+
+    class Opener(Counter):
+        def __init__(self, **named):
+            super().__init__(**named)
+            self.when_active(self.fail)
+            self.when_active(lambda: made.append(self.get_name()))
+
+        def fail(self):
+            if self.get_name() == ALIAS:
+                raise OSError("no such device")
+
+    pair = pair_of(stage, Opener)
+    with pytest.raises(OSError, match="no such device"):
+        pair.conductor.hand_over()
+        stage.spin_until(lambda: False, "the error")
+    stage.spin_until(lambda: made == ["counter", ALIAS], "the second opening")
+    stage.remove(pair.first)
+    stage.instance(Opener, 3, alias="counter_18", shadow=True)
+    Conductor(stage, source=2, destination=3).prepare()
+
+
 def test_inputs_are_served_between_two_services_that_open(stage, counter):
     """The node serves inputs between openings, because DDS takes some ms for each."""
     talker = stage.plain.create_publisher(Int64, "add", RELIABLE)

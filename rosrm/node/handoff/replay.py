@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, Final
 
 from rosrm import clocks
@@ -14,8 +14,6 @@ _SLICE: Final = 0.02
 _IDLE: Final = 0.02
 #: Seconds after which the further work no longer waits for cycles.
 _MOST_SPREAD: Final = 0.1
-#: Marks the end of the steps.
-_END: Final = object()
 
 
 class InputReplay:
@@ -35,7 +33,7 @@ class InputReplay:
         self._pause: Any = None
         self._is_idle = False
         self._spread_until = 0.0
-        self._beside: Iterator[None] = iter(())
+        self._beside: Callable[[], bool] = lambda: False
         self._then: Callable[[], None] = lambda: None
         self._counted = 0
 
@@ -44,12 +42,12 @@ class InputReplay:
         """Return True while buffered messages may be left; new messages then queue behind them."""
         return self._timer is not None
 
-    def begin(self, beside: Iterator[None]) -> None:
+    def begin(self, beside: Callable[[], bool]) -> None:
         """Serve all buffered messages, in slices, from the executor's next round on.
 
-        The generator `beside` (further work) is advanced by one step after each slice, then after
-        each cycle, and without a pause once the node is idle. A step takes some ms; just before the
-        next message it would delay that message.
+        `beside` does one step of further work, and returns False if there is none. It is called
+        after each slice, then after each cycle, and without a pause once the node is idle. A step
+        takes some ms; just before the next message it would delay that message.
         """
         self._beside, self._is_idle = beside, False
         self._spread_until = clocks.boot_time() + _MOST_SPREAD
@@ -72,7 +70,7 @@ class InputReplay:
 
     def _advance(self) -> bool:
         """Do one step of the further work; return False after the last one."""
-        if next(self._beside, _END) is not _END:
+        if self._beside():
             return True
         self._end_pause()
         return False
