@@ -396,7 +396,14 @@ Timer::SharedPtr Node::add_timer(
 void Node::keep_parameters()
 {
   parameters_set_ = add_post_set_parameters_callback(
-    [this](const std::vector<rclcpp::Parameter> &) {parameters_changed_ = true;});
+    [this](const std::vector<rclcpp::Parameter> & parameters) {
+      parameters_changed_ = true;
+      for (const auto & parameter : parameters) {
+        if (has_parameter(parameter.get_name())) {  // otherwise it is being declared
+          set_at_run_time_.insert(parameter.get_name());
+        }
+      }
+    });
   keep_state<ParameterEvent>(
     "~/_rosrm/parameters",
     [this]() -> std::optional<ParameterEvent> {
@@ -411,18 +418,27 @@ void Node::keep_parameters()
       for (const auto & name : names) {
         rclcpp::Parameter parameter;
         if (get_parameter(name, parameter)) {  // false: declared, but never set
-          event.changed_parameters.push_back(parameter.to_parameter_msg());
+          const bool was_set = set_at_run_time_.count(name) > 0;
+          auto & into = was_set ? event.changed_parameters : event.new_parameters;
+          into.push_back(parameter.to_parameter_msg());
         }
       }
       return event;
     },
     [this](const ParameterEvent & event) {
+      for (const auto & message : event.new_parameters) {  // declared ones may differ here
+        const auto parameter = rclcpp::Parameter::from_parameter_msg(message);
+        if (!has_parameter(parameter.get_name())) {
+          declare_parameter(parameter.get_name(), parameter.get_parameter_value());
+        }
+      }
       std::vector<rclcpp::Parameter> differing;
       for (const auto & message : event.changed_parameters) {
         const auto parameter = rclcpp::Parameter::from_parameter_msg(message);
         if (parameter.get_type() == rclcpp::PARAMETER_NOT_SET) {
-          continue;  // of a source in Python, which names those without a value, too
+          continue;  // of a source in Python of an earlier release
         }
+        set_at_run_time_.insert(parameter.get_name());
         if (!has_parameter(parameter.get_name())) {
           declare_parameter(parameter.get_name(), parameter.get_parameter_value());
         }

@@ -59,13 +59,16 @@ void spin_until(const std::function<bool()> & condition, const std::string & wha
   }
 }
 
+/// Default of the parameter `rate`.
+std::int64_t rate = 5;
+
 class Counter : public Node
 {
 public:
   explicit Counter(const rclcpp::NodeOptions & options = rclcpp::NodeOptions())
   : Node("counter", options)
   {
-    declare_parameter("rate", rclcpp::ParameterValue(std::int64_t{5}));
+    declare_parameter("rate", rclcpp::ParameterValue(rate));
     if (has_limit) {
       declare_parameter("limit", rclcpp::PARAMETER_INTEGER);
     }
@@ -165,6 +168,11 @@ const std::map<std::string, std::function<void()>> kCases{
         [](Counter & node) {
           expect(node.value("rate") == 7 && node.value("late") == 1, "another rate or no `late`");
         });
+    }},
+  {"a_new_default", [] {
+      restart(
+        [](Counter &) {rate = 6;},
+        [](Counter & node) {expect(node.value("rate") == 6, "the rate of the earlier program");});
     }},
   {"a_parameter_without_a_value", [] {
       has_limit = true;

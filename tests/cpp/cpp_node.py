@@ -403,13 +403,28 @@ class Node(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
             core.call("node_keep_state", full.encode(), kind, len(core.parts) - 1)
 
     def _keep_parameters(self) -> None:
+        declared, were_set = set(self._parameters), set()
+
+        def note(parameters: list[Parameter]) -> None:
+            names = {one.name for one in parameters}
+            were_set.update(names & declared)
+            declared.update(names)
+
+        self.add_post_set_parameters_callback(note)
+
         def save() -> ParameterEvent:
-            values = [one.to_parameter_msg() for one in self._parameters.values()]
-            return ParameterEvent(changed_parameters=values)
+            event = ParameterEvent()
+            for one in self._parameters.values():
+                was_set = one.name in were_set
+                into = event.changed_parameters if was_set else event.new_parameters
+                into.append(one.to_parameter_msg())
+            return event
 
         def restore(event: ParameterEvent) -> None:
             theirs = [Parameter.from_parameter_msg(one) for one in event.changed_parameters]
-            for one in theirs:
+            were_set.update(one.name for one in theirs)
+            added = [Parameter.from_parameter_msg(one) for one in event.new_parameters]
+            for one in (*added, *theirs):
                 if not self.has_parameter(one.name):
                     self.declare_parameter(one.name, one.value)
             differing = [

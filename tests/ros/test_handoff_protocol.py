@@ -442,6 +442,25 @@ def test_an_opening_is_made_in_the_active_node_and_destroyed_in_the_silent_one(s
     assert made[1:] == [("destroyed", "counter"), ("made", ALIAS)]
 
 
+def test_a_successor_has_the_parameters_of_its_own_spec(stage, counter):
+    """Only those set at run time move, also over two moves; otherwise `apply` changes nothing."""
+
+    class Tuned(counter):
+        def __init__(self, gain, **named):
+            super().__init__(parameter_overrides=[Parameter("gain", value=gain)], **named)
+            self.declare_parameter("gain", 0.5)
+            self.declare_parameter("limit", 1)
+
+    first = stage.instance(Tuned, 1, gain=1.0)
+    first.set_parameters([Parameter("limit", value=7)])
+    for number, gain in ((2, 2.0), (3, 3.0)):
+        alias = f"counter_{number}"
+        node = stage.instance(Tuned, number, alias=alias, shadow=True, gain=gain)
+        Conductor(stage, source=number - 1, destination=number).hand_over()
+        assert node.get_parameter("gain").value == gain
+        assert node.get_parameter("limit").value == 7
+
+
 def test_a_successor_whose_opening_fails_can_be_moved(stage):
     """The author may catch the error; the other openings and the role of a source follow."""
     made = []

@@ -174,7 +174,10 @@ def type_name(message_type: Any) -> str:
 
 
 class ParametersPart(StateTopic):
-    """The parameters of a node, with values set at run time."""
+    """The parameters of a node: those set at run time, and those that are only declared.
+
+    A declared one has its value from the spec or the program, and a successor may have others.
+    """
 
     def __init__(self, topic: str, node: Any) -> None:
         super().__init__(topic, ParameterEvent, self._all, self._take_over)
@@ -182,24 +185,33 @@ class ParametersPart(StateTopic):
         self._name = node.get_fully_qualified_name()  # read now: not available at shutdown
         self._changed = True
         self._count = 0
+        self._declared = set(node._parameters)  # noqa: SLF001 - rclpy has no way to list all values
+        self._set: set[str] = set()
         node.add_post_set_parameters_callback(self._note)
 
-    def _note(self, _parameters: list[Parameter]) -> None:
+    def _note(self, parameters: list[Parameter]) -> None:
         self._changed = True
+        names = {one.name for one in parameters}
+        self._set |= names & self._declared
+        self._declared |= names
 
     def _all(self) -> ParameterEvent | None:
         known = self._node._parameters  # noqa: SLF001 - rclpy has no way to list all values
         if not self._changed and len(known) == self._count:
             return None
         self._changed, self._count = False, len(known)
-        return ParameterEvent(
-            node=self._name,
-            changed_parameters=[one.to_parameter_msg() for one in known.values()],
-        )
+        event = ParameterEvent(node=self._name)
+        for one in known.values():
+            if one.type_ is not Parameter.Type.NOT_SET:
+                was_set = one.name in self._set
+                into = event.changed_parameters if was_set else event.new_parameters
+                into.append(one.to_parameter_msg())
+        return event
 
     def _take_over(self, event: ParameterEvent) -> None:
+        declared = [Parameter.from_parameter_msg(one) for one in event.new_parameters]
         parameters = [Parameter.from_parameter_msg(one) for one in event.changed_parameters]
-        for parameter in parameters:
+        for parameter in (*declared, *parameters):
             if not self._node.has_parameter(parameter.name):
                 self._node.declare_parameter(parameter.name, parameter.value)
         differing = [one for one in parameters if not self._has(one)]
@@ -208,6 +220,7 @@ class ParametersPart(StateTopic):
         if not result.successful:
             names = ", ".join(one.name for one in differing)
             raise ValueError(f"{names} cannot be set: {result.reason}")
+        self._set.update(one.name for one in parameters)
 
     def _has(self, parameter: Parameter) -> bool:
         own = self._node.get_parameter_or(parameter.name, None)

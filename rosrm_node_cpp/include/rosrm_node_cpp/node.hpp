@@ -25,6 +25,7 @@
 #include <memory>
 #include <mutex>
 #include <optional>
+#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -184,6 +185,8 @@ private:
   rclcpp::Node::PostSetParametersCallbackHandle::SharedPtr parameters_set_;
   bool parameters_changed_ = true;
   std::size_t parameters_known_ = 0;
+  /// Names of the parameters that were set, here or in a predecessor, and not only declared.
+  std::set<std::string> set_at_run_time_;
 };
 
 // --- implementation ----------------------------------------------------------------------------

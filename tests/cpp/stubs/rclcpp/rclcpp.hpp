@@ -595,6 +595,7 @@ public:
               "cannot declare a statically typed parameter with an uninitialized value");
     }
     stub_declare(name);
+    stub_call_post_set({Parameter(name, default_value)});  // it has no parameter of the name yet
     return parameters_[name] = default_value;
   }
 
@@ -653,11 +654,7 @@ public:
     for (const auto & one : parameters) {
       parameters_[one.get_name()] = one.get_parameter_value();
     }
-    for (const auto & weak : post_set_) {
-      if (const auto handle = weak.lock()) {
-        handle->callback(parameters);
-      }
-    }
+    stub_call_post_set(parameters);
     return {true, ""};
   }
 
@@ -699,6 +696,15 @@ public:
   }
 
 private:
+  void stub_call_post_set(const std::vector<Parameter> & parameters)
+  {
+    for (const auto & weak : post_set_) {
+      if (const auto handle = weak.lock()) {
+        handle->callback(parameters);
+      }
+    }
+  }
+
   void stub_declare(const std::string & name) const
   {
     if (name.empty() || has_parameter(name)) {

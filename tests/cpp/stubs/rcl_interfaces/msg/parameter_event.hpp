@@ -49,12 +49,14 @@ struct ParameterEvent
 inline void stub_write(StubBytes & out, const ParameterEvent & event)
 {
   ::stub_write(out, event.node);
+  ::stub_write(out, event.new_parameters);
   ::stub_write(out, event.changed_parameters);
 }
 
 inline void stub_read(const StubBytes & in, std::size_t & at, ParameterEvent & event)
 {
   ::stub_read(in, at, event.node);
+  ::stub_read(in, at, event.new_parameters);
   ::stub_read(in, at, event.changed_parameters);
 }
 
