@@ -177,10 +177,12 @@ class _Writer:
         with self._changed:
             self._waiting = sequence, blocks
             self._changed.notify()
-        if (
-            self._thread is None
-        ):  # not earlier, because writing would delay a successor's announcement
+        if self._thread is not None:
+            return
+        try:  # not earlier, because writing would delay a successor's announcement
             self._thread = threads.start(self._work, "rosrm snapshots", again=True)
+        except RuntimeError as fault:  # a limit of threads
+            self._not_written(fault)
 
     def close(self) -> None:
         """Write the waiting snapshot, and end the thread."""
@@ -226,7 +228,7 @@ class _Writer:
                 f"its state is saved again, up to cycle {sequence}"
             )
 
-    def _not_written(self, error: OSError) -> None:
+    def _not_written(self, error: Exception) -> None:
         if self._fault != str(error):
             self._fault = str(error)
             self._warn(
