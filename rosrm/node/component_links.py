@@ -21,7 +21,9 @@ from rclpy.node import Node
 
 from rosrm import clocks, threads
 from rosrm.component import link
+from rosrm.errors import describe_fault
 from rosrm.node.identity import made_for
+from rosrm.node.migratable import restore_now
 from rosrm.runtime.signalling import send
 from rosrm.wording import reason_of
 
@@ -112,6 +114,11 @@ class ComponentLinks:
             raise ProcessLookupError("its process has ended")
         with made_for(request["environment"]):
             node = self._make(str(request["plugin"]), list(request["arguments"]))
+        try:
+            restore_now(node)
+        except BaseException:
+            destroy(node, self._log.error)
+            raise
         self.nodes.append(node)
         self._executor.add_node(node)
         return node
@@ -142,7 +149,7 @@ class ComponentLinks:
             try:
                 work()
             except FAULTS as error:
-                faults.append(f"{type(error).__name__}: {error}")
+                faults.append(describe_fault(error))
             if faults:
                 self._log.error(f"cannot load a component: {faults[0]}")
                 gc.collect()  # a node whose constructor raised is in the graph until it is freed
@@ -158,7 +165,7 @@ def destroy(node: Node, report: Callable[[str], object]) -> None:
     try:
         node.destroy_node()
     except FAULTS as error:
-        report(f"cannot destroy a component: {type(error).__name__}: {error}")
+        report(f"cannot destroy a component: {describe_fault(error)}")
 
 
 def _is_bound(listening: socket.socket, where: str) -> bool:

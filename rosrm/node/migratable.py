@@ -187,5 +187,16 @@ class Migratable(_Base):  # type: ignore[misc]  # rclpy brings no types
             self._rosrm.entities.destroyed(entity)
 
 
+def restore_now(node: Any) -> None:
+    """Restore the snapshot of a node whose constructor has returned, if it has one.
+
+    Raises:
+        StateError: the node must be destroyed. In an executor, the error would end all its nodes.
+    """
+    session = node._rosrm if isinstance(node, Migratable) else None  # noqa: SLF001 - a node of ours
+    if session is not None:
+        session.restore_now()
+
+
 class Node(Migratable, rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
     """rclpy's `Node`, migratable: see `Migratable`."""

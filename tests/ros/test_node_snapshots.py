@@ -5,18 +5,24 @@ from __future__ import annotations
 import gc
 import time
 import zlib
+from contextlib import suppress
+from select import select
 
 import pytest
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Int64
 from std_srvs.srv import Trigger
 
+from rosrm.component import link
 from rosrm.node import Node
+from rosrm.node.component_links import ComponentLinks
+from rosrm.node.handoff.state_parts import StateError
 from rosrm.node.managed_node import Mode
 from rosrm.node.migratable import _NODES
+from rosrm.node.snapshots import restore, writer
 from rosrm.node.snapshots.marks import POSITIONS
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, encoded_head
@@ -24,6 +30,8 @@ from rosrm.version import PROTOCOL_VERSION
 from rosrm_msgs.msg import HandoffReport, StateMark
 from tests.old_marks import old_mark
 from tests.ros.nodes import ALIAS, RELIABLE, Conductor, Counter, Counting
+from tests.unit.node.test_component_links import connected
+from tests.waiting import wait_until
 
 LATCHED = QoSProfile(
     depth=10, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -222,6 +230,80 @@ def test_a_state_without_a_cycle_is_not_kept(stage, tmp_path, counter):
     """The next start has it from the constructor; here the constructor may have failed halfway."""
     stage.remove(stage.instance(counter, 1, keep=tmp_path))
     assert reader.newest_head(tmp_path) is None
+
+
+def test_a_node_at_its_limit_of_threads_works_and_keeps_its_state_later(
+    stage, tmp_path, monkeypatch
+):  # fmt: skip
+    """Its first cycle would end it, after each start again."""
+
+    def refused(*_, **__):
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(writer.threads, "start", refused)
+        node = stage.instance(Counter, 1, keep=tmp_path)
+        stage.spin_until(lambda: node.count >= 3, "three counts")
+    stage.spin_until(lambda: kept_up_to(tmp_path, 3), "a kept state")
+
+
+class Refusing(Counter):
+    """A counter that refuses each state."""
+
+    def restore(self, _message: Int64) -> None:
+        raise ValueError("too old")
+
+
+@pytest.fixture
+def refused(stage, tmp_path):
+    """Return a directory with a snapshot."""
+    first = stage.instance(Counter, 1, keep=tmp_path)
+    stage.spin_until(lambda: first.count >= 2, "two counts")
+    stage.remove(first)
+    return tmp_path
+
+
+def test_an_executor_of_several_threads_ends_with_a_failed_restore(stage, refused):
+    """It would report the error of a callback only after the next one, which never comes."""
+    node = stage.instance(Refusing, 1, keep=refused)
+    stage.executor.remove_node(node)
+    executor = MultiThreadedExecutor(2, context=stage.context)
+    executor.add_node(node)
+    with pytest.raises(StateError, match="restoring /counter/state raised ValueError: too old"):
+        wait_until(lambda: executor.spin_once(0.1), "the error")
+    executor.shutdown()
+
+
+def test_a_process_that_catches_the_error_of_a_failed_restore_is_ended(
+    stage, refused, monkeypatch
+):  # fmt: skip
+    """It would look healthy, and neither work nor be restarted."""
+    codes: list[int] = []
+    monkeypatch.setattr(restore, "_END_PATIENCE", 0.0)
+    monkeypatch.setattr(restore.os, "_exit", codes.append)
+    stage.instance(Refusing, 1, keep=refused)
+
+    def is_ended() -> bool:
+        with suppress(StateError):
+            stage.spin(0.1)
+        return bool(codes)
+
+    wait_until(is_ended, "the end")
+    assert codes == [1]
+
+
+def test_a_component_whose_snapshot_cannot_be_restored_ends_no_other(stage, refused):
+    """Its process says why it is not loaded; in the executor, the error would end them all."""
+    log, make = stage.plain.get_logger(), lambda *_: Refusing(context=stage.context)
+    links = ComponentLinks(str(refused), stage.executor, make, log)
+    with connected(str(refused)) as connection:
+        environment = stage.environment("counter", 2, shadow=False, keep=refused)
+        link.send(connection, {"environment": environment, "plugin": "", "arguments": []})
+        stage.spin_until(lambda: select([connection], [], [], 0)[0], "the answer")
+        answer = link.receive(connection)
+    assert "restoring /counter/state raised ValueError: too old" in answer["fault"]
+    assert links.nodes == []
+    stage.spin(0.1)
 
 
 class Unready(Node):

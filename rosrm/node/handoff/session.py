@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from rosrm import clocks
+from rosrm.errors import describe_fault
 from rosrm.keys.names import instance_name
 from rosrm.node.handoff.destination import Destination
 from rosrm.node.handoff.source import HandoffSource
@@ -53,6 +54,7 @@ class HandoffSession:
         self._parts: list[StateTopic] = []
         self._source: HandoffSource | None = None
         self._destination: Destination | None = None
+        self._restore: SnapshotRestore | None = None
         self._before_source: deque[StateConfig] = deque(maxlen=_MOST_EARLY)
         self._refused: set[str] = set()
         self._early: deque[tuple[StateConfig, float]] = deque(maxlen=_MOST_EARLY)
@@ -72,7 +74,9 @@ class HandoffSession:
                 self.entities, self._parts, self._own(_MARK), self._become_source
             )
         elif self._snapshot is not None:
-            SnapshotRestore(self.entities, self._parts, self._snapshot, self._become_source)
+            self._restore = SnapshotRestore(
+                self.entities, self._parts, self._snapshot, self._become_source
+            )
         else:
             self._become_source()
         self._subscription = self.entities.plain.create_subscription(
@@ -82,8 +86,13 @@ class HandoffSession:
     def _own(self, path: str) -> str:
         return f"{self.entities.visible_node}/{path}"
 
+    def restore_now(self) -> None:
+        """Restore the snapshot, if there is one, before the first round; raises `StateError`."""
+        if self._restore is not None:
+            self._restore.restore()
+
     def _become_source(self) -> None:
-        self._snapshot = None
+        self._snapshot = self._restore = None
         self._source = HandoffSource(self.entities, self._parts, self._own(_MARK))
         while self._before_source:
             self._configured(self._before_source.popleft())
@@ -146,7 +155,7 @@ class HandoffSession:
             try:
                 role.configure(config, self._opened_links())
             except Exception as error:  # noqa: BLE001 - no message of the master may end the node
-                what = f"{type(error).__name__}: {error}"
+                what = describe_fault(error)
                 self.entities.node.get_logger().error(
                     f"a state_config cannot be followed: {what}", throttle_duration_sec=10.0
                 )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from rosrm import clocks
 from rosrm.node.handoff.state_parts import StateError, StateTopic, differing_part, size_fault
@@ -20,6 +21,9 @@ from rosrm_msgs.msg import StateMark
 #: Seconds for the author's constructor to name all parts, if it spins first; check interval.
 _PATIENCE: Final = 10.0
 _LOOK: Final = 0.02
+#: Seconds in which the error of a failed restore must end the process, and between two such errors.
+_END_PATIENCE: Final = 10.0
+_RAISED_AGAIN: Final = 1.0
 #: Oldest protocol version whose snapshots can be read.
 _OLDEST_READ: Final = 5
 _REMEDY: Final = (
@@ -57,22 +61,50 @@ class SnapshotRestore:
         self._snapshot = snapshot
         self._done = done
         self._give_up = clocks.boot_time() + _PATIENCE
-        self._timer = steady_timer(entities.plain, 0.0, self._restore)
+        self._fault = ""
+        self._timer: Any = None
+        self._call_in(0.0, self._look)
 
-    def _restore(self) -> None:
+    def _call_in(self, seconds: float, call: Callable[[], None]) -> None:
+        if self._timer is not None:
+            self._entities.plain.destroy_timer(self._timer)
+        self._timer = steady_timer(self._entities.plain, seconds, call)
+
+    def _look(self) -> None:
         with self._entities.turn:
-            plain = self._entities.plain
-            plain.destroy_timer(self._timer)
             if self._is_incomplete() and clocks.boot_time() < self._give_up:
-                self._timer = steady_timer(plain, _LOOK, self._restore)
+                self._call_in(_LOOK, self._look)
                 return
             try:
-                mark = self._restored()
-            except StateError as fault:
-                message = f"the snapshot {self._snapshot.path} cannot be restored: {fault}"
-                self._entities.node.get_logger().error(f"{message}. {_REMEDY}")
-                raise StateError(message) from fault
-            self._start(mark)
+                self.restore()
+            except StateError:
+                self._give_up = clocks.boot_time() + _END_PATIENCE
+                self._call_in(_RAISED_AGAIN, self._end_process)
+                raise
+
+    def restore(self) -> None:
+        """Restore the snapshot now, because the author's constructor has returned.
+
+        Raises:
+            StateError: the snapshot cannot be restored, and the node must not start.
+        """
+        try:
+            mark = self._restored()
+        except StateError as fault:
+            self._fault = f"the snapshot {self._snapshot.path} cannot be restored: {fault}"
+            self._entities.node.get_logger().error(f"{self._fault}. {_REMEDY}")
+            raise StateError(self._fault) from fault
+        self._entities.plain.destroy_timer(self._timer)
+        self._start(mark)
+
+    def _end_process(self) -> None:
+        """End a process that goes on after the error: it would look healthy, and do nothing.
+
+        An executor of several threads reports the error of a callback only after another one.
+        """
+        if clocks.boot_time() >= self._give_up:  # the author catches the errors
+            os._exit(1)
+        raise StateError(self._fault)
 
     def _is_incomplete(self) -> bool:
         """Return True if the author's constructor spins before it has named all parts."""
