@@ -27,6 +27,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.utilities import remove_ros_args
 
+from rosrm.errors import describe_fault
 from rosrm.node.component_links import FAULTS, ComponentLinks, destroy
 from rosrm.node.identity import made_for
 from rosrm.ros.fast_dds import announcing
@@ -78,7 +79,7 @@ class Container:
         try:
             node = self._made(request)
         except FAULTS as error:
-            response.error_message = f"{request.plugin_name}: {type(error).__name__}: {error}"
+            response.error_message = f"{request.plugin_name}: {describe_fault(error)}"
         if response.error_message:
             self.node.get_logger().error(f"cannot load {response.error_message}")
             gc.collect()  # a node whose constructor raised is in the graph until it is freed

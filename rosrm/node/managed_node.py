@@ -18,6 +18,7 @@ from typing import Any, Final
 from rclpy.executors import MultiThreadedExecutor
 
 from rosrm import clocks
+from rosrm.errors import describe_fault
 from rosrm.node.entities import (
     DeferredAnswer,
     GatedPublisher,
@@ -353,7 +354,7 @@ class NodeEntities:
         try:
             opening.close()
         except Exception as error:  # noqa: BLE001 - the author's code may raise anything
-            what = f"{type(error).__name__}: {error}"
+            what = describe_fault(error)
             self.node.get_logger().error(f"falling silent, and closing raised {what}")
 
     def covered_inputs(

@@ -35,5 +35,6 @@ def fails(stage, pair, text, *, of=2):
     pair.conductor.say(StateConfig.SHADOW)
     report = pair.conductor.wait(of, HandoffReport.FAILED)
     assert text in report.message
+    assert len(report.message) < 2000, "the master drops far longer texts"
     goes_on(stage, pair.counts)
     assert HandoffReport.READY not in pair.conductor.of(2)

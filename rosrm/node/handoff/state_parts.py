@@ -10,6 +10,7 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message, serialize_message
 
+from rosrm.errors import describe_fault
 from rosrm.node.handoff.snapshot_assembler import PartKey, part_key
 from rosrm.snapshots.format import MOST_CYCLES, Block
 from rosrm_msgs.msg import StateMark, StatePart
@@ -84,9 +85,7 @@ class StateTopic:
         except StateError:
             raise
         except Exception as error:  # the author's code may raise anything
-            raise StateError(
-                f"saving {self.topic} raised {type(error).__name__}: {error}"
-            ) from error
+            raise StateError(f"saving {self.topic} raised {describe_fault(error)}") from error
         if data is not None and len(data) > LARGEST_PART:
             raise StateError(
                 f"the state on {self.topic} has {len(data)} bytes, more than the {LARGEST_PART} "
@@ -131,9 +130,7 @@ class StateTopic:
         try:
             self._restore(deserialize_message(data, self.message_type))
         except Exception as error:  # the author's code may raise anything
-            raise StateError(
-                f"restoring {self.topic} raised {type(error).__name__}: {error}"
-            ) from error
+            raise StateError(f"restoring {self.topic} raised {describe_fault(error)}") from error
         self._restored = key
         # The author's next `save` may return None (unchanged), which refers to this state.
         self._key, self._data, self._published = key, data, None

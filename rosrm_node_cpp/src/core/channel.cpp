@@ -1,5 +1,6 @@
 #include "rosrm_node_cpp/core/channel.hpp"
 
+#include <algorithm>
 #include <utility>
 
 #include "rosrm_node_cpp/core/cdr.hpp"
@@ -9,6 +10,18 @@ namespace rosrm_node
 
 namespace
 {
+
+/// Most bytes of the text in a report: receivers drop reports with far longer ones.
+constexpr std::size_t kLongestText = 1500;
+
+/// Return a text in printable ASCII and of bounded length, because the author's may be anything.
+std::string printable(std::string text)
+{
+  text.resize(std::min(text.size(), kLongestText));
+  std::replace_if(
+    text.begin(), text.end(), [](unsigned char one) {return one < 0x20 || one > 0x7e;}, '?');
+  return text;
+}
 
 std::string named(const char * kind, const std::string & process, std::uint64_t number)
 {
@@ -103,8 +116,9 @@ void Channel::take(const Bytes & data)
   }
 }
 
-void Channel::report(Phase phase, std::uint64_t sequence, const std::string & message)
+void Channel::report(Phase phase, std::uint64_t sequence, const std::string & text)
 {
+  const std::string message = printable(text);
   if (last_ && last_->phase == phase && last_->message == message) {
     return;
   }

@@ -104,6 +104,21 @@ def test_a_component_that_exits_in_its_constructor_ends_no_other(tmp_path):
                 assert link.receive(connection) == fault
 
 
+def test_the_error_of_a_component_is_made_printable(tmp_path):
+    """The log of rclpy refuses another text, and the refusal would end the container."""
+    errors: list[str] = []
+
+    def make(*_: object) -> object:
+        raise ValueError("cannot read map-\udcff.pgm")
+
+    name = str(tmp_path)
+    with container(name, make, errors), connected(name) as connection:
+        link.send(connection, REQUEST)
+        fault = link.receive(connection)["fault"]
+    assert fault == "ValueError: cannot read map-?.pgm"
+    assert errors == [f"cannot load a component: {fault}"]
+
+
 def test_a_container_without_a_further_thread_says_so(tmp_path, monkeypatch):
     """Otherwise the process would report that its container has ended."""
     errors: list[str] = []
