@@ -438,7 +438,6 @@ void Node::keep_parameters()
         if (parameter.get_type() == rclcpp::PARAMETER_NOT_SET) {
           continue;  // of a source in Python of an earlier release
         }
-        set_at_run_time_.insert(parameter.get_name());
         if (!has_parameter(parameter.get_name())) {
           declare_parameter(parameter.get_name(), parameter.get_parameter_value());
         }

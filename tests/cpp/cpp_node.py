@@ -422,7 +422,6 @@ class Node(rclpy.node.Node):  # type: ignore[misc]  # rclpy brings no types
 
         def restore(event: ParameterEvent) -> None:
             theirs = [Parameter.from_parameter_msg(one) for one in event.changed_parameters]
-            were_set.update(one.name for one in theirs)
             added = [Parameter.from_parameter_msg(one) for one in event.new_parameters]
             for one in (*added, *theirs):
                 if not self.has_parameter(one.name):

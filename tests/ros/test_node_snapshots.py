@@ -19,7 +19,7 @@ from std_srvs.srv import Trigger
 from rosrm.component import link
 from rosrm.node import Node
 from rosrm.node.component_links import ComponentLinks
-from rosrm.node.handoff.state_parts import StateError
+from rosrm.node.handoff.state_parts import ParametersPart, StateError
 from rosrm.node.managed_node import Mode
 from rosrm.node.migratable import _NODES
 from rosrm.node.snapshots import restore, writer
@@ -245,6 +245,30 @@ def test_a_node_at_its_limit_of_threads_works_and_keeps_its_state_later(
         node = stage.instance(Counter, 1, keep=tmp_path)
         stage.spin_until(lambda: node.count >= 3, "three counts")
     stage.spin_until(lambda: kept_up_to(tmp_path, 3), "a kept state")
+
+
+def test_parameters_in_a_snapshot_of_an_earlier_release_are_not_set_for_ever(
+    stage, tmp_path, monkeypatch
+):  # fmt: skip
+    """It has all of them as set; those that the next instance has anyway can change later."""
+
+    def tuned(number, gain):
+        overrides = [Parameter("gain", value=gain)]
+        node = stage.instance(Busy, number, keep=tmp_path, parameter_overrides=overrides)
+        stage.spin_until(lambda: node.count > 2 * number, "counts")
+        stage.remove(node)
+        return node.get_parameter("gain").value
+
+    save = ParametersPart._all
+
+    def all_set(part):
+        part._set |= part._declared
+        return save(part)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ParametersPart, "_all", all_set)
+        assert tuned(1, 1.0) == 1.0
+    assert [tuned(2, 1.0), tuned(3, 3.0)] == [1.0, 3.0]
 
 
 class Refusing(Counter):

@@ -217,7 +217,6 @@ class ParametersPart(StateTopic):
         if not result.successful:
             names = ", ".join(one.name for one in differing)
             raise ValueError(f"{names} cannot be set: {result.reason}")
-        self._set.update(one.name for one in parameters)
 
     def _has(self, parameter: Parameter) -> bool:
         own = self._node.get_parameter_or(parameter.name, None)

@@ -185,7 +185,7 @@ private:
   rclcpp::Node::PostSetParametersCallbackHandle::SharedPtr parameters_set_;
   bool parameters_changed_ = true;
   std::size_t parameters_known_ = 0;
-  /// Names of the parameters that were set, here or in a predecessor, and not only declared.
+  /// Names of the parameters that were set, also from the state of a predecessor.
   std::set<std::string> set_at_run_time_;
 };
 
