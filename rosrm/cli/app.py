@@ -41,7 +41,7 @@ def _leave_removed_directory() -> None:
         os.getcwd()  # noqa: PTH109 - pathlib is not imported yet
     except OSError as error:
         os.chdir("/")
-        _say(f"rosrm: the current directory cannot be used ({reason_of(error)}); going on in /")
+        _say(f"rosrm: the current directory cannot be used ({reason_of(error)}); continuing in /")
 
 
 def _open_closed_streams() -> None:

@@ -129,8 +129,8 @@ def answered(call: Callable[[], T], what: str, seconds: float = PATIENCE) -> T:
         outcome = outcomes.get(timeout=seconds)
     except queue.Empty:
         raise RosrmError(
-            f"{what} has not ended within {seconds:g} s: the kernel, or a file system without an "
-            "answer, holds it"
+            f"{what} has not ended within {seconds:g} s: the kernel, or a file system that does "
+            "not answer, blocks it"
         ) from None
     return outcome()
 

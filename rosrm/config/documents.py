@@ -199,8 +199,8 @@ def _text(path: Path) -> str:
         raise ConfigError(f"{path}: cannot be read: {reason_of(error)}") from None
     if len(content) > _LARGEST:
         raise ConfigError(
-            f"{path}: it has more than {_LARGEST >> 20} MiB, and is probably another file. Divide "
-            "a larger one, or use `foreach` and `array` for similar processes"
+            f"{path}: it has more than {_LARGEST >> 20} MiB, so it is probably not a rosrm file. "
+            "Divide a larger work file, or use `foreach` and `array` for similar processes"
         )
     try:
         return content.decode("utf-8-sig")

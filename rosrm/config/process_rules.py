@@ -173,7 +173,7 @@ def _about_placeholders(spec: ProcessSpec) -> Iterator[Complaint]:
     known += [ARTIFACTS] if spec.artifacts else []
     for key in WITH_PLACEHOLDERS:
         if key != "environment" and has_variable(repr(getattr(spec, key))):
-            text = f"{key}: {{env.NAME}} stands in `environment` only"
+            text = f"{key}: {{env.NAME}} is allowed only in `environment`"
             yield Complaint((key,), text)
         for fault in placeholder_faults(repr(getattr(spec, key)), known):
             given = "parameters" if key == "parameter_sources" else key
@@ -303,7 +303,7 @@ def _about_surroundings(spec: ProcessSpec) -> Iterator[Complaint]:
         elif fault := variable_fault(value):
             yield Complaint(("environment", name), f"environment.{name}: {fault}")
         elif spec.container.image and has_variable(value):
-            text = f"environment.{name}: the variables of an image are not known"
+            text = f"environment.{name}: {{env.NAME}} cannot name a variable of an image"
             yield Complaint(("environment", name), text)
 
 

@@ -41,7 +41,7 @@ def parameter_fault(name: str, value: Any) -> str:
     if any(isinstance(item, int) and not -(2**63) <= item < 2**63 for item in items):
         return "a whole number of 64 bits is required, -2**63 to 2**63 - 1"
     if any(isinstance(item, str) and _UNPASSABLE.search(item) for item in items):
-        return "a text without the character NUL and without halves of pairs is required"
+        return "a text without the character NUL and without lone surrogates is required"
     return "a list in ROS parameters has values of one type only" if len(kinds) > 1 else ""
 
 

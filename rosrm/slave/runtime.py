@@ -430,7 +430,7 @@ class SlaveRuntime:
         """Report another name of this machine, by which commands on it recognize their host."""
         name = socket.gethostname()
         if name != self._endpoint.description.hostname:
-            _log.info("this machine is named %r now; its host stays %r", name, self._config.host)
+            _log.info("this machine is now named %r; its host is still %r", name, self._config.host)
             self._endpoint.describe_again(self._description())
 
     def _look_at_health(self, now: float) -> None:

@@ -131,7 +131,7 @@ class Shutdown:
             _log.error("%s", self._supervisor_fault)
             return self._fail_without_supervisor()
         if _live(self._begun()):  # the supervisor waits for none that SIGKILL does not end
-            self._supervisor_fault = "SIGKILL has not ended what the supervisor left"
+            self._supervisor_fault = "SIGKILL has not ended processes that the supervisor left"
             return self._fail_without_supervisor()
         self.endpoint.wait_until_received()
         part = "supervisor" if cause == STOP_ALL else "slave"
@@ -162,7 +162,9 @@ class Shutdown:
         try:
             self.endpoint.leave(informed, running)
         except Exception as fault:  # noqa: BLE001 - the processes are to be stopped all the same
-            _log.warning("the master was not informed of the end: %s", describe_fault(fault))
+            _log.warning(
+                "the master was not informed that this slave ends: %s", describe_fault(fault)
+            )
             return
         deadline = clocks.boot_time() + _LEAVE_PATIENCE
         self.serve(lambda: not self._is_informed and clocks.boot_time() < deadline)

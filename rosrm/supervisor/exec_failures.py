@@ -52,7 +52,7 @@ def _cause(path: str, error: OSError) -> str:
         if error.errno == errno.ENOEXEC and machine not in ("", os.uname().machine):
             return f"it is a program for {machine}, and this host is {os.uname().machine}"
         if error.errno in (errno.ENOEXEC, errno.EINVAL):
-            return "its file is damaged, or no program: it begins as one (ELF)"
+            return "its file begins like a program (ELF), but is damaged or is not one"
     elif error.errno == errno.ENOEXEC:
         return f"it is neither a program nor a script with #!{' (it is empty)' * (not head)}"
     return reason_of(error)

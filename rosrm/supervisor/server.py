@@ -323,7 +323,7 @@ class Server:
         delayed = []
         for key in keys:
             if not durable:
-                failed = f"not started, for it could not be recorded: {self._record.trouble}"
+                failed = f"not started, because it could not be recorded: {self._record.trouble}"
                 self._spawn_failed(key, failed, transient=True)
                 continue
             try:
@@ -347,7 +347,7 @@ class Server:
         if late is not None and late.waits() > spawn.PATIENCE:
             waiting = tuple(self._spawns)
             self._spawns.clear()
-            failed = f"not started, for {late.directory} does not answer ({spawn.PATIENCE:g} s)"
+            failed = f"not started, because {late.directory} does not answer ({spawn.PATIENCE:g} s)"
             for key in waiting:
                 self._spawn_failed(key, failed, transient=True)
         return late is not None
@@ -390,7 +390,7 @@ class Server:
     def _check_former_start(self, key: Key) -> None:
         for process, step in self._stuck.values():
             if process == key[0]:
-                message = f"a former start of it still waits for {step}, which does not answer"
+                message = f"an earlier start of it still waits for {step}, which does not answer"
                 raise SpawnError(message, transient=True)
 
     def _advance(self, start: _Start, step: Callable[[], spawn.Attempt]) -> None:

@@ -389,7 +389,7 @@ def test_a_command_in_a_removed_directory_works(rosrm, tmp_path) -> None:
     assert run.returncode == 0, run.stderr
     assert "talker" in run.stdout
     assert run.stderr.splitlines() == [
-        "rosrm: the current directory cannot be used (No such file or directory); going on in /"
+        "rosrm: the current directory cannot be used (No such file or directory); continuing in /"
     ]
 
 

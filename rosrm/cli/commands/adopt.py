@@ -61,7 +61,7 @@ def adopt(
     from rosrm.supervisor.procfs import boot_id
 
     limit = longest(timeout)
-    facts = answered(lambda: read_facts(pid), f"the look at process {pid}")
+    facts = answered(lambda: read_facts(pid), f"the inspection of process {pid}")
     with connection.master(ctx, domain) as client:
         row = local_host(client.list_hosts(), host)
         settings = connection.ros_settings(ctx, domain)

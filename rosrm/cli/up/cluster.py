@@ -128,8 +128,8 @@ class UpCluster(LocalCluster):
         marks = {pid: f"{pid}: {refused[pid]}" if pid in refused else f"{pid}" for pid in left}
         names = listed(f"{what} (pid {marks[pid]})" for pid, what in left.items())
         raise StillRunning(
-            f"{names} cannot be killed. A process that waits for a file system without an answer "
-            "ends when that answers, or is unmounted"
+            f"{names} cannot be killed. A process that waits for a file system that does not "
+            "answer ends when the file system answers or is unmounted"
         )
 
     def _left(self) -> dict[int, str]:

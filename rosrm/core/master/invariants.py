@@ -46,7 +46,7 @@ def check(state: MasterState) -> None:
 
 
 def places(state: MasterState) -> Iterator[str]:
-    """Each process is in exactly one place, which matches its phase."""
+    """Check that each process is in exactly one place, which matches its phase."""
     held_back = list(state.queue.arrays)
     queued = {*state.queue, *held_back}
     if len(queued) != len(state.queue) + len(held_back):
@@ -70,7 +70,7 @@ def places(state: MasterState) -> Iterator[str]:
         elif not (moves or process.image is not None or process.owner in process.instances):
             awaits_end = process.wanted is not DesiredState.RUN and process.instances
             if not awaits_end:
-                yield f"{what} has no owner, and waits for no end"
+                yield f"{what} has no owner, and no instance whose end it awaits"
         if process.left_behind is not None and (
             process.is_at_rest or process.owner in state.instances
         ):
@@ -78,7 +78,7 @@ def places(state: MasterState) -> Iterator[str]:
 
 
 def indices(state: MasterState) -> Iterator[str]:
-    """Each index has what a recount gives."""
+    """Compare each index with a recount."""
     ended = {name for name, one in state.processes.items() if one.phase.is_terminal}
     live = {name: one for name, one in state.processes.items() if name not in ended}
     yield from _differs("terminal", state.terminal, ended)
@@ -110,7 +110,7 @@ def indices(state: MasterState) -> Iterator[str]:
 
 
 def declared(state: MasterState) -> Iterator[str]:
-    """Each index has what the spec in force of a process declares."""
+    """Compare each index with the declarations in the specs that are in force."""
     live = {name: one for name, one in state.processes.items() if not one.phase.is_terminal}
     for name, rules in state.neighbours.declared.items():
         if name in live and rules != live[name].spec.neighbours:
@@ -136,7 +136,7 @@ def declared(state: MasterState) -> Iterator[str]:
 
 
 def gangs(state: MasterState) -> Iterator[str]:
-    """The index has exactly the processes that await their gang, which have not started."""
+    """Check that the index has exactly the processes that await their gang, not yet started."""
     found = [(gang, name) for gang, names in state.gangs.members.items() for name in names]
     awaiting = {(one.gang, name) for name, one in state.processes.items() if one.awaits_gang}
     yield from _differs("gangs", found, awaiting)
@@ -147,7 +147,7 @@ def gangs(state: MasterState) -> Iterator[str]:
 
 
 def instances(state: MasterState) -> Iterator[str]:
-    """Each instance is known to its process and its host, which have no other ones."""
+    """Check that the instances of each process and each host are exactly the known ones."""
     by_process, strays, by_host = (defaultdict[str, set[int]](set) for _ in range(3))
     for number, instance in state.instances.items():
         name = instance.id.process
@@ -183,7 +183,7 @@ def instances(state: MasterState) -> Iterator[str]:
 
 
 def specs(state: MasterState) -> Iterator[str]:
-    """Each instance has the spec with which it runs; the owner has that of its process."""
+    """Check the spec of each instance; the owner must have the spec of its process."""
     for name, process in state.processes.items():
         spec, owner = process.spec, state.owner_of(process)
         if spec.name != name:
@@ -200,7 +200,7 @@ def specs(state: MasterState) -> Iterator[str]:
 
 
 def reservations(state: MasterState) -> Iterator[str]:
-    """Each reservation is what its spec needs beyond the readings; each load is their sum."""
+    """Check that each reservation matches the spec and the readings, and each load their sum."""
     for host in state.hosts.hosts:
         held = [state.instances[number] for number in host.instances]
         total = np.zeros(len(state.hosts.resources))
@@ -237,7 +237,7 @@ def _differ(some: FloatArray, others: FloatArray) -> bool:
 
 
 def applications(state: MasterState) -> Iterator[str]:
-    """Each application has the versions that it names, and tasks for its processes alone."""
+    """Check the versions that each application names, and that its tasks are for its processes."""
     for name, one in state.applications.items():
         for number in (one.wanted, one.former):
             if number and number not in one.versions:
@@ -252,7 +252,7 @@ def applications(state: MasterState) -> Iterator[str]:
 
 
 def ledger(state: MasterState) -> Iterator[str]:
-    """The ledger has the specs that are kept, each with its owner."""
+    """Check that the ledger has exactly the stored specs, each with its owner."""
     processes = {(one.principal, process_key(name)) for name, one in state.processes.items()}
     versions = {
         (one.principal, version_key(name, number))
@@ -264,10 +264,10 @@ def ledger(state: MasterState) -> Iterator[str]:
 
 
 def orders(state: MasterState) -> Iterator[str]:
-    """Each pending order belongs to something that exists."""
+    """Check that each pending order belongs to an object that exists."""
     for order, purpose in state.pending_orders:
         if not _exists(state, purpose):
-            yield f"the order {order} is of nothing: {purpose}"
+            yield f"the order {order} belongs to no object: {purpose}"
     yield from _beyond("migrations", state.migrations, state.processes)
     yield from _beyond("standbys", state.standbys, state.processes)
     for name, migration in state.migrations.items():
@@ -304,7 +304,7 @@ def _differs(what: str, index: Iterable[object], recount: AbstractSet[object]) -
     has = set(index)
     if has != recount:
         more, fewer = sorted(map(str, has - recount)), sorted(map(str, recount - has))
-        yield f"{what}: {more} too many, without {fewer}"
+        yield f"{what}: {more} too many, {fewer} missing"
 
 
 def _beyond(what: str, part: Iterable[str], whole: Iterable[str]) -> Iterator[str]:

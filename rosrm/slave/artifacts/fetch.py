@@ -105,8 +105,8 @@ class Fetch:
             self._end(self._not_fetched(str(part)))
         elif part.size != self.artifact.size or not part.data:
             self._end(self._not_fetched(
-                f"the master has {part.size} bytes for its digest, and the process names "
-                f"{self.artifact.size}"
+                f"the master's archive with this digest has {part.size} bytes, but the process "
+                f"names {self.artifact.size}"
             ))  # fmt: skip
         else:
             self._write(part.data)

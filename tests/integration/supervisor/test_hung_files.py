@@ -61,7 +61,7 @@ def test_a_start_that_waits_for_a_path_is_cancelled_at_once(host, hung):
             wait_until(lambda: hung.unanswered, "a request of the start")
             client.send(StopOrdered(("waits", 1)))
             assert host.ended(client, "waits").state is InstanceState.EXITED
-    assert "a former start of it still waits" in host.ended(client, "waits", number=2).message
+    assert "an earlier start of it still waits" in host.ended(client, "waits", number=2).message
 
 
 def test_a_process_that_crashes_as_its_disk_hangs_holds_up_no_other(host, hung):

@@ -36,8 +36,10 @@ def test_an_adoption_that_does_not_happen_is_waited_for_in_vain_only_so_long(
 def test_a_look_that_the_kernel_holds_is_left_to_itself():
     """A process or a file on a dead disk holds the command for its time-out alone."""
     held = threading.Event()
-    with pytest.raises(RosrmError, match=r"the look at process 7 has not ended within 0\.05 s"):
-        answered(held.wait, "the look at process 7", 0.05)
+    with pytest.raises(
+        RosrmError, match=r"the inspection of process 7 has not ended within 0\.05 s"
+    ):
+        answered(held.wait, "the inspection of process 7", 0.05)
     held.set()
 
 

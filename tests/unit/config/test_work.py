@@ -817,7 +817,7 @@ def test_a_variable_of_the_host_stands_in_variables_only(file, refusal):
     ok = text.replace("KEY", "environment: {P: '/{i}:{env.P}', Q: 'a$ 5$'}")
     assert one(file(ok)).environment == {"P": "/1:{env.P}", "Q": "a$ 5$"}
     said = refusal(load_work, text.replace("KEY", "arguments: ['{env.P}']"))
-    assert "arguments: {env.NAME} stands in `environment` only" in said
+    assert "arguments: {env.NAME} is allowed only in `environment`" in said
 
 
 def test_a_home_in_the_first_argument_is_refused_too(refusal):

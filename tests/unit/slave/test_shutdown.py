@@ -192,4 +192,4 @@ def test_a_master_that_cannot_be_informed_keeps_no_process_running(slave, monkey
     slave.when_stopped = stop
     slave.end()
     assert stopped == [True]
-    assert "the master was not informed of the end: RuntimeError" in slave.log.text
+    assert "the master was not informed that this slave ends: RuntimeError" in slave.log.text

@@ -254,7 +254,7 @@ class Lab:
         if check and process.returncode:
             raise LabError(
                 f"{command[0]} on {host}: {ending_of(process.returncode)}: "
-                f"{troubles.strip() or said.strip() or 'it said nothing'}"
+                f"{troubles.strip() or said.strip() or 'it printed nothing'}"
             )
         return subprocess.CompletedProcess(list(command), process.returncode, said, troubles)
 

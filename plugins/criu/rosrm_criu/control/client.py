@@ -223,7 +223,7 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
     except OSError as error:
         raise PortableError(f"{directory} cannot be written: {reason_of(error)}") from None
     if pid is not None and (why := send(pid, SIGNAL)):
-        raise PortableError(f"process {pid} cannot be woken: {why}")
+        raise PortableError(f"process {pid} cannot be signalled: {why}")
 
 
 def listens(pid: int) -> bool:

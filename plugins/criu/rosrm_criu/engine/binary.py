@@ -169,7 +169,7 @@ def opened(program: Path) -> CriuBinary:
     if answer.returncode != 0 or version is None:
         line = (answer.stderr.strip() or answer.stdout.strip() or "nothing").splitlines()[-1]
         raise CriuError(
-            f"{program} is no CRIU that works: `--version` printed {line!r} "
+            f"{program} is not a working CRIU: `--version` printed {line!r} "
             f"({ending_of(answer.returncode)})"
         )
     return CriuBinary((str(program),), version[1])

@@ -211,7 +211,7 @@ def _link(pid: int, name: str) -> str:
 
 def _explained(directory: Path, error: Exception) -> str:
     if isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.ESRCH):
-        return f"it could not be looked at: {reason_of(error)}"
+        return f"the process could not be examined: {reason_of(error)}"
     if isinstance(error, OSError):
         return f"the image in {directory} cannot be written: {reason_of(error)}"
     return str(error)

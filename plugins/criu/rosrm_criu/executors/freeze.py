@@ -77,7 +77,7 @@ def control_of(pid: int) -> Path:
     try:
         found = directory_of(process_tree.root_of(pid))
     except OSError as error:
-        raise CriuError(f"process {pid} cannot be looked at: {reason_of(error)}") from None
+        raise CriuError(f"process {pid} cannot be examined: {reason_of(error)}") from None
     if found is None:
         raise CriuError(
             f"process {pid} was not started to be moved by criu: restart it, with "

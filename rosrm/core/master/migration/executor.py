@@ -270,7 +270,7 @@ def _undo_reason(state: MasterState, migration: Migration) -> str:
     if state.processes[migration.process].wanted is DesiredState.CANCEL:
         return f"a cancellation of {migration.process} was requested"
     if _is_given_up(state, migration):
-        return f"its application is to have the version that {migration.source} has"
+        return f"the application now requires the version that {migration.source} runs"
     end = migration.ended.get(migration.source.number)
     if end is None:
         return ""
