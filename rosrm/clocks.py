@@ -1,8 +1,8 @@
 """The clocks of rosrm. No other module reads a clock of the machine; a rule of ruff checks this.
 
 Durations, deadlines, leases and fences need a clock that is never set and never stops. Only the
-boot clock is both: NTP sets the clock of the day, and `time.monotonic` stops while the
-machine is suspended. All times of a part are of the boot clock, so that two can be compared.
+boot clock is such a clock: NTP sets the wall clock, and `time.monotonic` stops while the machine is
+suspended. All times of a part are of the boot clock, so that two can be compared.
 
 A time after which others act counts the time of a suspend. A time in which this machine has to do
 something does not, because it does nothing while it is suspended: a core leaves out the seconds
@@ -20,7 +20,7 @@ graces of a stop (SIGINT, SIGTERM), also those of a whole slave       awake time
 readiness, loads of components, transitions of a lifecycle node       awake time (`Slept`)
 fetch of an artifact or of a snapshot                                 awake time (`leave_out`)
 health: one look counts a bounded share of its time-out               awake time
-start that a path holds up; wait for a directory of state or logs      awake time
+start that waits for a path; wait for a directory of state or logs     awake time
 calls of plugins, launchers, probes                                   awake time
 ====================================================================  ======================
 """
@@ -56,7 +56,7 @@ def suspended_time() -> float:
 
 
 class Suspends:
-    """Suspends of this machine since the last question."""
+    """Suspends of this machine since the last call of `new`."""
 
     #: Seconds; the two clocks are not read at the same moment.
     LEAST: Final = 0.1

@@ -10,10 +10,11 @@ from typing import Final, NoReturn
 
 from rosrm.wording import sanitized
 
-#: Most letters of the text of an exception, and of a text that a plugin returns. Receivers of
-#: messages accept many more, so that no sentence around such a text exceeds their bounds.
+#: Maximum number of characters of the text of an exception, and of a text that a plugin returns.
+#: Receivers of messages accept many more, so a sentence with such a text never exceeds their
+#: bounds.
 LONGEST_TEXT: Final = 1_500
-#: Most letters of the place of an exception.
+#: Maximum number of characters of the place of an exception.
 _LONGEST_PLACE: Final = 500
 #: Packages that load and call plugins; their frames are never frames of a plugin.
 _LOADERS: Final = frozenset({

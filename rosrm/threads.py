@@ -1,6 +1,6 @@
-"""The one way to start a thread: a fault ends none without notice.
+"""Start of threads: a fault in a thread is always logged.
 
-Python prints the traceback of a thread that raises, and its part runs on without it.
+Python only prints the traceback of a thread that raises, and the part continues without it.
 """
 
 # ruff: noqa: PLC0415, TID251 - a fault is rare, and memory is budgeted; the one place of threads

@@ -9,7 +9,7 @@ from __future__ import annotations
 import tarfile
 from typing import Any, Final
 
-#: Most bytes of an extended header: a name and the target of a link, of 4096 bytes each.
+#: Maximum bytes of an extended header: a name and the target of a link, of 4096 bytes each.
 LARGEST_HEADER: Final = 1 << 14
 _PLAIN: Final = (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.DIRTYPE, tarfile.SYMTYPE)
 _EXTENDED: Final = (tarfile.XHDTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK)

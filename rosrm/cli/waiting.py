@@ -104,10 +104,10 @@ def _say_time_is_up(result: WaitResult) -> None:
 
 
 def answered(call: Callable[[], T], what: str, seconds: float = PATIENCE) -> T:
-    """Return the result of a call that a file system or the kernel may hold.
+    """Return the result of a call that a file system or the kernel may block.
 
     Args:
-        call: is left to itself in its thread if it does not return.
+        call: stays in its thread if it does not return in time.
         what: subject of the message, e.g. "the search for a file".
         seconds: time-out.
 

@@ -11,7 +11,7 @@ from typing import Final
 
 from rosrm.model.rows import EventRow, Listing
 
-#: Known events: more than a journal loses.
+#: Number of known events that are remembered; a journal gap is shorter.
 _KNOWN: Final = 1000
 #: Number of events in one listing that leaves out none, as in `List.srv`.
 _ALL: Final = 2**32 - 1

@@ -20,7 +20,7 @@ from rosrm.wording import reason_of
 
 #: Highest number of values in one file; values behind an alias count at each use of the alias.
 MOST_VALUES: Final = 200_000
-#: Most bytes of a file: reading one of this size takes some seconds.
+#: Maximum size of a file in bytes: reading a file of this size takes some seconds.
 _LARGEST: Final = 1 << 24
 #: Key whose mappings are merged into the one around it.
 _MERGE: Final = "<<"

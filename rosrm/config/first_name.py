@@ -36,9 +36,9 @@ def first_name(directory: Path) -> str:
 
 
 def keep_name(directory: Path, host: str) -> str:
-    """Keep the name of a host in a directory; return what a user has to know, "": nothing.
+    """Store the name of a host in a directory; return a note for the user, "": none.
 
-    A name that the file of the host gives is not kept: it is no name of the machine.
+    A name that the file of the host gives is not stored, because it is not the machine's name.
     """
     name, kept = socket.gethostname(), _kept(directory)
     if not kept and host == name:

@@ -11,7 +11,7 @@ from rosrm.model.parameters import sections_of
 from rosrm.model.values import ParameterSource
 from rosrm.wording import one_line
 
-#: Most letters of a file.
+#: Maximum number of characters of a file.
 _LARGEST: Final = 1 << 24
 
 
@@ -46,7 +46,7 @@ _RosLoader.add_multi_constructor("tag:yaml.org,2002:python/", _untagged)
 
 
 def _size(node: yaml.Node, known: dict[int, int]) -> int:
-    """Return the letters of a document in which each alias is written out.
+    """Return the number of characters of a document in which each alias is written out.
 
     `known`: sizes of nodes that were met before; an alias that contains itself has no end.
     """
@@ -67,7 +67,7 @@ def parse_parameters(text: str) -> tuple[ParameterSource, ...]:
         loader = _RosLoader(text)
         root = loader.get_single_node()
         if root is not None and _size(root, {}) > _LARGEST:
-            raise ValueError(f"with its aliases it has more than {_LARGEST} letters")
+            raise ValueError(f"with its aliases it has more than {_LARGEST} characters")
         document = None if root is None else loader.construct_document(root)
     except yaml.YAMLError as error:
         raise ValueError(one_line(str(error))) from None

@@ -40,7 +40,7 @@ from rosrm.wording import listed
 _TOPIC: Final = re.compile(r"(~?/)?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 #: A name in a rule of ROS, which may have the name of a node and wildcards.
 _REMAPPED: Final = re.compile(r"[^\s:=\0]+(:[^\s:=\0]+)*")
-#: Bytes of a variable, with its name, that the kernel refuses for a new program.
+#: Bytes of a variable, with its name, from which on the kernel starts no program with it.
 _LONGEST_TEXT: Final = 1 << 17
 _LIFECYCLE: Final = ("unconfigured", "inactive", "active", "finalized")
 _ROS_ONLY: Final = ("node_name", "namespace", "parameters", "remappings")

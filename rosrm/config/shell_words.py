@@ -1,4 +1,4 @@
-"""Words of a command line as a shell splits it, where a shell would do nothing else to it."""
+"""Split of a command line into words, refused if a shell would do more than split it."""
 
 from __future__ import annotations
 

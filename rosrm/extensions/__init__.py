@@ -14,7 +14,7 @@ declared_fields.py   fields of a spec that an offer declares to read
 placement.py         selected policies and filters, for the core
 array_types.py       types of the arrays in the views of hosts
 link_views.py        links and flows as scoring policies read them
-guard.py             the one way into the code of a plugin
+guard.py             the guard of every call of a plugin
 plugin_calls.py      record of the calls of a part
 plugin_deadline.py   time-out and pauses of the plugins of a master
 process_state.py     restoration of what a plugin changed in its process

@@ -26,7 +26,7 @@ from rosrm.errors import PluginError, plain_text
 
 T = TypeVar("T")
 
-#: Most values in one answer, and most letters of a text in it.
+#: Maximum number of values in one answer, and of characters of a text in it.
 MOST_VALUES: Final = 100_000
 LONGEST_VALUE: Final = 1 << 16
 
@@ -156,7 +156,7 @@ class _Copy:
         return found
 
 
-#: Types of copies of collections; of any other sequence a tuple is made.
+#: Types of copies of collections; any other sequence becomes a tuple.
 _MADE: Final[Mapping[type[Any], Callable[[Iterable[Any]], Any]]] = {
     list: list, set: set, frozenset: frozenset, AbstractSet: frozenset,
 }  # fmt: skip
@@ -180,7 +180,7 @@ def _one_of(value: Any, hint: Any, where: str) -> Any:
 
 def _check_text(text: str, where: str) -> None:
     if len(text) > LONGEST_VALUE:
-        raise PluginError(f"{where} has {len(text)} letters; allowed: {LONGEST_VALUE}")
+        raise PluginError(f"{where} has {len(text)} characters; allowed: {LONGEST_VALUE}")
     try:
         text.encode()
     except UnicodeEncodeError:

@@ -72,7 +72,7 @@ def declared_spec(spec: ProcessSpec, reads: tuple[str, ...]) -> ProcessSpec:
 
 
 def unshared(value: T) -> T:
-    """Return a value of which a plugin may change every mapping and list, as they are copies."""
+    """Return a value with copies of all mappings and lists, so that a plugin may change them."""
     return cast(T, _unshared(value))
 
 

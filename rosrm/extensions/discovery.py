@@ -66,7 +66,7 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 _NAME_FORM: Final = (
     'at most 64 letters, digits, "_", "-" and ".", the first of them a letter or digit'
 )
-#: Most offers of one hook.
+#: Maximum number of offers of one hook.
 _MOST_OFFERS: Final = 256
 #: Least and highest value of a field of an offer, by its name.
 _RANGES: Final[Mapping[str, tuple[float, float]]] = {

@@ -1,6 +1,6 @@
-"""The one way into the code of a plugin: a time-out, any exception, and the state of the process.
+"""Guard of every call of a plugin: a time-out, any exception, and the state of the process.
 
-`PluginCalls.ask` adds the record of a part. A test finds calls of plugins beside these two.
+`PluginCalls.ask` adds the record of a part. A test fails for any other call of a plugin.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def in_process(whom: str, hook: str, call: Callable[[], T], *, often: bool = Fal
     slot, pid = 0 if _notes is None else _notes.begin(whom, hook), os.getpid()
     try:
         if threading.current_thread() is not threading.main_thread():
-            return _called(call, lambda: False)  # the user's reaches the main thread alone
+            return _called(call, lambda: False)  # Ctrl-C interrupts only the main thread
         before, interrupts = ProcessState(whole=not often), Interrupts()
         try:
             return _called(call, lambda: interrupts.pressed)

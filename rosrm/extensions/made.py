@@ -214,7 +214,7 @@ def fault_of_labels(labels: object, before: Sequence[MadeProbe]) -> str:
         if not (key and _is_text(key) and _is_text(value)):
             return (
                 f"has the label {key!r:.100}: {value!r:.100}; printable text of at most "
-                f"{_LONGEST_LABEL} letters is required"
+                f"{_LONGEST_LABEL} characters is required"
             )
         others = [one.name for one in before if one.labels.get(key, value) != value]
         if others:

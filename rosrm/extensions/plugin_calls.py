@@ -284,7 +284,7 @@ def required(answer: object, kind: type[T]) -> T:
 
     A text is returned as a printable `str` of bounded length; newlines stay.
     """
-    if not issubclass(type(answer), kind):  # `isinstance` believes its `__class__`
+    if not issubclass(type(answer), kind):  # `isinstance` would trust its `__class__`
         raise PluginError(f"answered {given(answer)}; {kind.__name__} is required")
     return cast(T, plain_text(answer, lines=True) if kind is str else answer)
 

@@ -23,7 +23,8 @@ _SLOW: Final = 0.25
 #: With the default lease of 10 s a plugin holds the loop for half of it at most.
 _MOST_SLOW: Final = 4.0
 _GIVEN_BACK: Final = 0.1
-#: Longest pause in pauses after the first late call; each further one doubles it.
+#: Longest pause, as a multiple of the pause after the first late call; each further late call
+#: doubles the pause.
 _LONGEST: Final = 16.0
 
 

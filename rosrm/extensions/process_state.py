@@ -36,7 +36,7 @@ _OF_LIBRARIES: Final = (signal.SIGINT, signal.SIGTERM)
 #: Contents of `os.environ`. A copy is one step, which no thread of a plugin can divide; a copy of
 #: `os.environ` itself fails with `KeyError` if a thread removes a variable during it.
 _VARIABLES: Final[dict[bytes, bytes]] = vars(os.environb)["_data"]
-#: Most environment variables in a warning, and most letters of each.
+#: Maximum number of environment variables in a warning, and of characters of each.
 _NAMED: Final = 3
 _LONGEST_NAME: Final = 100
 
@@ -68,13 +68,13 @@ class ProcessState:
             os.umask(self._umask)
 
     def keep_own(self) -> None:
-        """Take what rosrm has changed itself: handlers, environment, garbage collection."""
+        """Adopt the changes by rosrm itself: handlers, environment, garbage collection."""
         self._handlers = [getsignal(number) for number in _SIGNALS]
         self._collects = gc.isenabled(), gc.get_threshold()
         self._environment = _VARIABLES.copy() if self._whole else {}
 
     def restore(self) -> list[str]:
-        """Restore what has changed since; return what it was. No effect in another thread."""
+        """Restore changed state, and return its names; do nothing in another thread."""
         if threading.current_thread() is not threading.main_thread():
             return []
         changed = []
@@ -186,7 +186,7 @@ def _directory() -> str:
 
 
 class Interrupts:
-    """Tells the user's Ctrl-C from a `KeyboardInterrupt` that a plugin raises itself.
+    """Distinguishes the user's Ctrl-C from a `KeyboardInterrupt` that a plugin raises.
 
     Only Python's own handler of SIGINT raises one: a master and a slave install others.
     """

@@ -60,9 +60,9 @@ def limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> T
 
 
 def end_limit() -> None:
-    """Interrupt the innermost call no more, as it has ended; only in the main thread.
+    """Stop interrupting the innermost call, which has ended; only in the main thread.
 
-    What restores the process after it calls functions, each of which would be interrupted.
+    Otherwise the functions that restore the process after the call would be interrupted, too.
     """
     if _Alarm.ringing is not None:
         _Alarm.ringing.stop()
@@ -80,7 +80,7 @@ def _limited(seconds: float, call: Callable[[], T], late: Callable[[], str]) -> 
         alarm.stop()
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         _Alarm.ringing = outer
-        # The default action stays replaced, because a last alarm on its way would end the process.
+        # The default action is not restored, because it would end the process at a last late alarm.
         if callable(before) and before is not _ring:
             install(signal.SIGALRM, before)
         if left:
@@ -154,7 +154,7 @@ class _Alarm:
         raise self._next_interrupt()
 
     def force(self) -> None:
-        """Interrupt an overdue call from another thread, as its own alarm was taken or stopped."""
+        """Interrupt an overdue call from another thread, because its alarm was disabled."""
         main = threading.main_thread().ident or 0
         handler = signal.getsignal(signal.SIGALRM)
         if handler is not _ring or self._was_forced:  # it may also be blocked
@@ -204,7 +204,7 @@ class _Alarm:
 
 
 class _Watch:
-    """Thread that interrupts an overdue call whose plugin has taken or stopped the alarm."""
+    """Thread that interrupts an overdue call whose plugin has disabled the alarm."""
 
     lock: ClassVar[threading.Lock] = threading.Lock()
     _pid: ClassVar[int] = 0

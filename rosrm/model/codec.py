@@ -161,7 +161,7 @@ def fields_from_plain(
     return _read_fields(shape, given, shape.required.intersection(names))
 
 
-#: Most bytes of a value of a plugin as JSON: of a plan, or a step.
+#: Maximum size in bytes of a plugin's value as JSON: of a plan, or a step.
 LONGEST_OF_PLUGIN: Final = 1 << 19
 
 

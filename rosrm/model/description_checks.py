@@ -23,7 +23,8 @@ _NODE_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,199}")
 _RESOURCE_NAME: Final = re.compile(r"[A-Za-z][A-Za-z0-9_.-]{0,63}")
 #: Seconds: the longest period of readings.
 _LONGEST_PERIOD: Final = 3600.0
-#: Most letters and entries in the description of a host, of which every listing has a part.
+#: Maximum number of characters and entries in the description of a host, of which every listing has
+#: a part.
 LARGEST_DESCRIPTION: Final = 1 << 16
 _ACCOUNTINGS: Final = get_args(Accounting)
 #: Examples of fields in the description of a resource.
@@ -111,7 +112,7 @@ def _size_fault(description: HostDescription) -> str:
     if size <= LARGEST_DESCRIPTION:
         return ""
     return (
-        f"has a description (labels, devices, plugins, reasons) of {size} letters and entries; "
+        f"has a description (labels, devices, plugins, reasons) of {size} characters and entries; "
         f"at most {LARGEST_DESCRIPTION}"
     )
 

@@ -33,7 +33,7 @@ _MISSPELT: Final = 0.75
 def extended(text: str, variables: Mapping[str, str]) -> str:
     """Return a variable with the values of the host's variables, as in `/x:{env.PYTHONPATH}`.
 
-    Of one that is not set, no `:` remains at an end, where it would mean the current directory.
+    If a variable is not set, no `:` remains at an end, where it would mean the current directory.
     """
 
     def value(found: re.Match[str]) -> str:

@@ -1,4 +1,4 @@
-"""Size of values in letters and entries, for the bounds of what others may store."""
+"""Size of values in characters and entries, for the bounds of stores."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Final
 
 
 def size_of(value: object) -> int:
-    """Return the number of letters and entries in a value, about its bytes as JSON.
+    """Return the number of characters and entries in a value, about its size as JSON.
 
     Fields of dataclasses with their defaults do not count.
     """

@@ -143,21 +143,22 @@ bounds_of: Final[Callable[[Any], tuple[Bound, ...]]] = cache(_find_bounds)
 
 
 def check_bounds(message: Any) -> int:
-    """Return the number of letters and entries in a message.
+    """Return the number of characters and entries in a message.
 
     Raises:
         Refused: the message, or a field of it, exceeds its bound.
     """
     size = _size(message)
     if size > LARGEST_MESSAGE:
-        raise Refused(f"a {type(message).__name__} of {size} letters; at most {LARGEST_MESSAGE}")
+        raise Refused(f"a {type(message).__name__} of {size} characters; at most {LARGEST_MESSAGE}")
     return size
 
 
 def fitted(row: Any) -> Any:
     """Return a row of a listing with each text and sequence cut to its bound.
 
-    Otherwise one row with a longer text, or with one that is no UTF-8, refuses the whole listing.
+    Otherwise receivers would refuse the whole listing because of one row with a longer text, or
+    with a text that is no UTF-8.
     """
     for field, slot, entries, letters, nested in bounds_of(type(row)):
         value = getattr(row, slot)
@@ -187,13 +188,14 @@ def _size(message: Any) -> int:
         if letters:
             for text in value if entries else (value,):
                 if len(text) > letters:
-                    raise _beyond(kind, field, "letters", len(text), letters)
+                    raise _beyond(kind, field, "characters", len(text), letters)
                 size += len(text)
         elif nested:
             size += sum(map(_size, value)) if entries else _size_of_known(value)
     if size > LARGEST_SPEC and kind is msg.ProcessSpec:
         raise Refused(
-            f"process {message.name!r:.60}: its texts have {size} letters; at most {LARGEST_SPEC}"
+            f"process {message.name!r:.60}: its texts have {size} characters; "
+            f"at most {LARGEST_SPEC}"
         )
     return size
 

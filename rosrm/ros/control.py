@@ -128,7 +128,7 @@ class RequestGate:
         if len(envelope.request_id) > _LONGEST_ID:
             return refused(
                 "invalid",
-                f"the id of the request of {envelope.sender} has more than {_LONGEST_ID} letters",
+                f"the id of a request of {envelope.sender} has more than {_LONGEST_ID} characters",
             )
         age = (self._beat() - envelope.receiver_beat) * _NS
         if envelope.receiver_beat == 0 or not 0.0 <= age <= self._max_age:

@@ -1,4 +1,4 @@
-"""Signals of a part of rosrm, which a plugin must not give to rclpy."""
+"""Protection of the signal handlers of a part of rosrm from `rclpy.init` of a plugin."""
 
 from __future__ import annotations
 

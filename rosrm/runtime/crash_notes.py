@@ -62,7 +62,7 @@ class CrashNotes:
     """
 
     def __init__(self, directory: Path) -> None:
-        if not directory.exists():  # the lock of the directory tightens an existing one
+        if not directory.exists():  # the lock restricts the rights of an existing one
             make_private_directory(directory)
         self._weights = directory / "plugin-crashes.json"
         self._known: dict[str, dict[str, Any]] = _read(self._weights)
@@ -72,7 +72,7 @@ class CrashNotes:
             str(self._path), os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
         )
         content = _boot().ljust(_SLOT, b"\0") + _EMPTY * _SLOTS
-        if os.write(self._descriptor, content) < len(content):  # a mapped hole would end us
+        if os.write(self._descriptor, content) < len(content):  # SIGBUS at a hole in the map
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         self._map = mmap.mmap(self._descriptor, _SLOT * (_SLOTS + 1))
         self._free = list(range(_SLOTS, 0, -1))

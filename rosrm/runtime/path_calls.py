@@ -1,4 +1,4 @@
-"""Calls on paths that users name, in threads: a path without an answer costs a loop nothing.
+"""Calls on paths that users name, in threads: a path that does not answer blocks no loop.
 
 On a file system that does not answer (a dead NFS server), an `open` or `stat` waits without a
 limit, and no signal ends it. So a loop hands such calls to a thread. The thread names each path
@@ -26,7 +26,7 @@ from rosrm.errors import RosrmError
 PATIENCE: Final = 10.0
 #: Seconds after which the calls behind another one get a thread of their own.
 LATE: Final = 0.2
-#: Most late calls.
+#: Maximum number of late calls.
 MOST_LATE: Final = 64
 #: Types of file systems that need another machine or program for an answer.
 _REMOTE: Final = (
@@ -54,7 +54,7 @@ def at(path: str | os.PathLike[str]) -> None:
 
 
 class PathCall:
-    """A call, and the path that it is at.
+    """A call, and the path that it is about to touch.
 
     Attributes:
         has_ended: no thread executes it any more, or will.

@@ -33,7 +33,7 @@ def file_fault(path: str) -> str:
 
 
 class FileFaults:
-    """Faults of the files of devices, looked at in a thread, because a file may not answer.
+    """Faults of the files of devices, checked in a thread, because a file may not answer.
 
     Args:
         run: as `PathCalls.run`.

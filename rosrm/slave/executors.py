@@ -24,9 +24,9 @@ _log = logging.getLogger("rosrm.slave")
 
 #: Marks an error that is too recent to forget, although a later call has succeeded.
 _SINCE: Final = "; it has succeeded since"
-#: Most calls of one executor that have not returned after their time-outs; each keeps a thread.
+#: Maximum number of calls of one executor that have not returned in time; each keeps a thread.
 MOST_LATE: Final = 8
-#: Most letters of a result, as the master accepts it.
+#: Maximum number of characters of a result, as the master accepts it.
 MOST_LETTERS_OF_RESULT: Final = 1 << 20
 #: Takes the outcome of an executor.
 Done = Callable[[ExecutorOutcome], None]

@@ -20,7 +20,7 @@ from rosrm.model.values import (
     is_plausible,
 )
 
-#: Most devices of a host, and most processes to which a probe attributes a resource.
+#: Maximum number of devices of a host, and of processes to which a probe attributes a resource.
 MOST_DEVICES: Final = 256
 MOST_PROCESSES: Final = 100_000
 #: Resource name to pid to amount, in the base unit of the resource.

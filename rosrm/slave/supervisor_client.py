@@ -53,7 +53,7 @@ _PATIENCE: Final = 30.0
 _STEADY: Final = 10.0
 _MOST_BRIEF: Final = 3
 _LONGEST_PAUSE: Final = 60.0
-#: Most seconds for which a status waits for the log of its component.
+#: Maximum time, in seconds, for which a status waits for the log of its component.
 _LOG_PATIENCE: Final = 1.0
 #: Seconds for which orders may wait before a message to the user.
 _LOGGED_AFTER: Final = 5.0

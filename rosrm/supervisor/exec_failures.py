@@ -9,7 +9,7 @@ from typing import Final
 
 from rosrm.wording import reason_of
 
-#: Most bytes of the first line that the kernel reads, and of the head of an ELF file looked at.
+#: Maximum bytes of the first line that the kernel reads, and of the head of an ELF file.
 _FIRST_LINE: Final = 256
 _HEAD: Final = 1 << 16
 #: Machine in an ELF header to its name, as of `uname -m`.

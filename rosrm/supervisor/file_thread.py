@@ -1,4 +1,4 @@
-"""File calls of the supervisor in a thread: a directory without an answer holds no loop.
+"""File calls of the supervisor in a thread: a directory that does not answer blocks no loop.
 
 On a file system that does not answer (a dead NFS server, a failing disk), each call waits without
 a limit. So the loop hands its calls on one directory to a thread, which executes them in order. The
@@ -24,7 +24,7 @@ from typing import Any, Final, Generic, TypeVar
 from rosrm import clocks
 from rosrm.supervisor import own_log
 
-#: Most seconds that the loop waits for a call.
+#: Maximum time, in seconds, that the loop waits for a call.
 LATE: Final = 1.0
 #: Seconds after which a thread asks the loop for the lock of the interpreter.
 _NEVER: Final = 1000.0
@@ -33,10 +33,10 @@ T = TypeVar("T")
 
 
 def let_threads_wait() -> None:
-    """Have no thread ask for the lock of the interpreter, for a process that calls `fork_into`.
+    """Keep threads from requesting the interpreter's lock, in a process that calls `fork_into`.
 
-    In a child that `fork_into` makes, the answer to that would wait for the thread for ever. The
-    loop gives up the lock in each wait for events.
+    Otherwise a child of `fork_into`, which has no such thread, would wait for the thread for ever.
+    The loop releases the lock in each wait for events.
     """
     sys.setswitchinterval(_NEVER)
 
@@ -165,7 +165,7 @@ class FileThread:
         return call.wait(0.0 if self.is_late else self._patience)
 
     def waits(self) -> float:
-        """Return the seconds since which the directory owes an answer; 0.0: it owes none."""
+        """Return for how many seconds a call has had no answer; 0.0: no call waits."""
         with contextlib.suppress(IndexError):  # the thread ends the last call just now
             return clocks.awake_time() - self._unfinished[0].asked
         return 0.0

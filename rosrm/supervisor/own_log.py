@@ -14,7 +14,7 @@ from rosrm.wording import printable, reason_of
 
 #: Bytes beyond which the log is emptied.
 MOST_BYTES: Final = 1 << 20
-#: Most lines that wait for the disk.
+#: Maximum number of lines that wait for the disk.
 MOST_WAITING: Final = 100
 #: Descriptor of the standard error.
 _ERRORS: Final = 2
@@ -82,7 +82,7 @@ def _written(line: str) -> bool:
 def write_fault(text: str) -> None:
     """Write a line, and the traceback of the exception that is being handled.
 
-    The module `traceback` would be imported by a descriptor, which may be what is missing.
+    The import of the module `traceback` needs a descriptor, and there may be none left.
     """
     _, fault, trace = sys.exc_info()
     lines = [text, "Traceback (most recent call last):"]

@@ -54,7 +54,7 @@ from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
 from rosrm.supervisor.spawn_error import SpawnError
 from rosrm.wording import listed, reason_of
 
-#: Most starts before their exec at a time.
+#: Maximum number of starts before their exec at a time.
 SPAWNS_A_ROUND: Final = 8
 #: Seconds after which a start that waits for a path no longer counts among these.
 LATE_START: Final = 0.5
@@ -141,7 +141,7 @@ class Server:
         """
         self._watch(self._listener, self._accept)
         self._watch_signals()
-        self._take_over()  # unguarded: what a half of it left out would be started a second time
+        self._take_over()  # unguarded: half of it could start processes twice
         while True:
             _guarded(self._round)
             if self._leaving:
@@ -203,7 +203,7 @@ class Server:
         return min(max(0.0, min(due) - clocks.boot_time()), LONGEST_WAIT) if due else None
 
     def _set_timer(self, deadline: float | None) -> None:
-        """Have the loop wake at a deadline of the core, also in a suspend of this machine."""
+        """Set the timer by which the loop wakes at a deadline of the core, also after a suspend."""
         if self._timer is None and deadline is not None:
             self._timer = BootTimer()
             if self._timer.descriptor >= 0:
@@ -753,7 +753,7 @@ class Server:
     def _signalled(self, signals: int) -> None:
         numbers = os.read(signals, 4096)
         if signal.SIGCHLD in numbers:
-            _guarded(self._trees.reap)  # its failure may lose no SIGTERM
+            _guarded(self._trees.reap)  # a failure must not lose a SIGTERM
         if signal.SIGTERM in numbers:
             self._happened(events.ShutdownOrdered())
 

@@ -188,7 +188,7 @@ def _become(
 
 
 def _reset_signals() -> None:
-    """Give all signals their default; the caller's Python, or who started it, ignores some."""
+    """Reset all signals to their default; Python or the starter of the caller ignores some."""
     signal.set_wakeup_fd(-1)  # a pipe of the parent
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
         if signal.getsignal(number) != signal.SIG_DFL:

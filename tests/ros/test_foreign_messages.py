@@ -442,7 +442,7 @@ def test_huge_messages_are_refused(cluster, user) -> None:
     )
     answer = user.ask(srv.Cancel, path(names.CANCEL), long).answer
     assert (answer.accepted, answer.code) == (False, "failed")
-    assert "Cancel_Request.processes has 10000000 letters" in answer.message
+    assert "Cancel_Request.processes has 10000000 characters" in answer.message
     cluster.is_attacked = True
     future = user.client(srv.Cancel, path(names.CANCEL)).call_async(huge)
     wait_until(

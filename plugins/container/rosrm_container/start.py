@@ -43,10 +43,10 @@ def main(argv: list[str]) -> None:
 
 
 def _copy_key(copy: Path) -> None:
-    """Copy the key of the instance for the container, whose user may be any.
+    """Copy the key of the instance for the container, which may run as any user.
 
-    The directory of the copy lets no other user of this host in. Without a key of the slave, as on
-    a full disk, podman reports the missing file, and the process is started again.
+    Other users of this host cannot enter the directory of the copy. If the slave could not write
+    the key, as on a full disk, podman reports the missing file, and the process is started again.
     """
     key = os.environ.get(KEY_FILE, "")
     if key:

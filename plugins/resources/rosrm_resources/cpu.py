@@ -234,7 +234,7 @@ def _quota(version: int, directory: Path) -> float | None:
 def _cpu_set(group: Group, root: Path) -> tuple[Path, float] | None:
     """Return the topmost group with the effective CPU set of this process, and the set's size.
 
-    Only there all processes are measured that share these CPUs. The process itself may be in a
+    Only that group measures all processes that share these CPUs. The process itself may be in a
     group below, such as that of the agents. None: no CPU set.
 
     Args:
@@ -249,7 +249,7 @@ def _cpu_set(group: Group, root: Path) -> tuple[Path, float] | None:
     for directory in sets.upward():
         try:
             size = count_cpus((directory / name).read_text())
-        except OSError:  # the controller is not enabled for this group, so that above counts
+        except OSError:  # the controller is not enabled for this group, so the group above counts
             continue
         if own and size != own:  # the set above contains this one, so another size is another set
             break

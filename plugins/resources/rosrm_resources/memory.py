@@ -1,8 +1,8 @@
 """Probe `memory`: bytes that are not available to another process.
 
 The memory of processes, of control groups and of slices is the same quantity, so that each can be
-compared with the others: anonymous and shared memory. Pages of files are no need, because the
-kernel drops them. On a whole machine the kernel's own memory counts too.
+compared with the others: anonymous and shared memory. Pages of files do not count, because the
+kernel can drop them. On a whole machine the kernel's own memory counts too.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ def create(options: MemoryOptions, context: ProbeContext) -> GaugeProbe:
 class MachineMemory:
     """Memory that the kernel cannot give without swapping; reclaimable cache is not usage.
 
-    The values come from /proc/meminfo, as in `psutil.virtual_memory`; ten reads a second of the
-    file itself cost a third. The cache of ZFS (ARC) shrinks as the page cache does, but
-    MemAvailable leaves it out.
+    The values come from /proc/meminfo, as in `psutil.virtual_memory`. Ten reads a second of the
+    open file cost a third of those by psutil. The cache of ZFS (ARC) shrinks as the page cache
+    does, but MemAvailable leaves it out.
 
     Args:
         proc: mount point of the process file system.

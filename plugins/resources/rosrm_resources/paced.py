@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-#: Most share of a core for one reading.
+#: Largest share of a core for one reading.
 _SHARE: Final = 0.03
 #: Seconds of CPU that are free: a reading of a few hundred processes is made each time.
 _FREE: Final = 0.003

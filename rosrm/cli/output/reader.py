@@ -27,7 +27,7 @@ def needed() -> Iterator[None]:
     """Exit with 1, as after a broken pipe, as soon as the reader of standard output has gone."""
     try:
         descriptor = sys.stdout.fileno()
-    except OSError:  # of a caller in Python
+    except OSError:  # a caller in Python may have replaced the standard output
         yield
         return
     before = signal.signal(signal.SIGPIPE, _end)

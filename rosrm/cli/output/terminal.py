@@ -26,7 +26,7 @@ _ENDING: Final = (signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 class Terminal:
-    """Keys of a terminal; of another standard input there are none.
+    """Keys of a terminal; none if the standard input is not a terminal.
 
     Args:
         stdin: the standard input.
@@ -97,5 +97,5 @@ class Terminal:
 
 
 def _exit(number: int, _frame: FrameType | None) -> None:
-    """Exit as a shell names the end by a signal."""
+    """Exit with the code by which a shell reports the end by this signal."""
     raise SystemExit(128 + number)

@@ -39,8 +39,8 @@ def main() -> None:
 def stop_supervisors(directory: Path) -> None:
     """Stop the supervisors of all hosts with their processes, and wait for their ends.
 
-    A supervisor waits for its processes, and one that waits for a dead disk never ends. So the
-    supervisor is killed after a while.
+    A supervisor waits for its processes, and a process that waits for a dead disk never ends. So
+    the supervisor is killed after a while.
     """
     for number in (signal.SIGTERM, signal.SIGKILL):
         locks = list(directory.glob("hosts/*/supervisor/supervisor.lock"))

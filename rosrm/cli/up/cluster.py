@@ -28,8 +28,8 @@ from rosrm.wording import ending_of, listed, reason_of
 _REGISTER: Final = 30.0
 #: Seconds for the master to end after SIGINT, when no slave is left.
 _END: Final = 10.0
-#: Seconds for the end of a slave, which stops its processes first. A slave that a plugin holds is
-#: killed then, and the end of its supervisor ends the processes.
+#: Seconds for the end of a slave, which stops its processes first. A slave that a plugin blocks is
+#: then killed, and the end of its supervisor ends the processes.
 _LONGEST_END: Final = 120.0
 #: Seconds between two looks at what still runs.
 _LOOK: Final = 0.05
@@ -94,7 +94,7 @@ class UpCluster(LocalCluster):
         for part in self.slaves.values():
             part.end()
         for part in self.slaves.values():
-            if not part.wait(_LONGEST_END):  # held by a plugin; the supervisor is stopped below
+            if not part.wait(_LONGEST_END):  # blocked by a plugin; the supervisor is stopped below
                 part.end(signal.SIGKILL)
                 part.wait(_END)
         cleaner.stop_supervisors(self.directory)
@@ -133,7 +133,7 @@ class UpCluster(LocalCluster):
         )
 
     def _left(self) -> dict[int, str]:
-        """Return the pids of what still runs of this cluster, with the names."""
+        """Return the pids of the processes of this cluster that still run, with their names."""
         parts = [part for part in (self.master, *self.slaves.values()) if part is not None]
         left = {part.process.pid: part.name for part in parts if not part.has_ended}
         for state in self.directory.glob("hosts/*/supervisor"):

@@ -49,6 +49,6 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
 
 
 def review(state: MasterState, now: float) -> None:
-    """Handle each order of which nothing was reported in time as one without an answer."""
+    """Treat each order without any report in time as an order without an answer."""
     for order in state.pending_orders.expired(now):
         order_answered(state, happened.OrderAnswered.missing(order), now)

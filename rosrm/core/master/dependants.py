@@ -41,7 +41,7 @@ def dependants_first(state: MasterState, processes: Sequence[Process]) -> list[P
 def binding_dependants(state: MasterState, process: Process) -> list[str]:
     """Return the dependants that hold back the stop and the removal of a process.
 
-    Those of other users do not, unless the user is an operator.
+    Dependants of other users hold back neither, unless an operator submitted them.
     """
     names = state.start_orders.dependants.get(process.name, ())
     return [name for name in names if may_affect(state.processes[name], process)]

@@ -10,7 +10,8 @@ from rosrm.wording import sanitized
 
 #: Upper bound of a number, because JSON may hold integers that no float can.
 _MOST: Final = 1e18
-#: Most durations in a result, and most letters of a name: a listing has the events of a day.
+#: Maximum number of durations in a result, and of characters of a name, because one listing has the
+#: events of a day.
 _MOST_PARTS: Final = 32
 _LONGEST_NAME: Final = 64
 

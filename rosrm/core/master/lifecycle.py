@@ -57,9 +57,9 @@ _EVENT: Final = {
     ProcessPhase.FAILED: EventKind.FAILED,
     ProcessPhase.CANCELLED: EventKind.CANCELLED,
 }
-#: Most instances of one host that the master has not assigned to it, and tracks until they end.
+#: Maximum number of strays of one host that the master tracks until they end.
 _MOST_STRAYS: Final = 256
-#: Most letters and entries of the status of an instance.
+#: Maximum number of characters and entries of the status of an instance.
 _LARGEST_STATUS: Final = 10_000
 #: Reported states in which nothing of the instance runs, and so the readings do not show it.
 _DOWN: Final = frozenset({InstanceState.STARTING, InstanceState.BACKOFF})
@@ -124,7 +124,7 @@ def _yet_to_start(state: MasterState, instance: Instance) -> bool:
 
 
 def _bounded(status: InstanceStatus) -> InstanceStatus:
-    """Return a status without what an honest slave does not send: endless texts and lists."""
+    """Return a status with bounded texts and lists, because a host may send any length."""
     if size_of(status) <= _LARGEST_STATUS:
         return status
     return replace(status, message=status.message[:_LARGEST_STATUS], enforced=(), devices=())
@@ -211,7 +211,7 @@ def _note_restarts(
             failover.note_restart(state, process)
     if process.restarts != status.restarts:
         process.phase_before_loss = None  # restarted while its host was silent
-        if not status.pid:  # that of a run counts the time since the first one
+        if not status.pid:  # with a pid the reported time counts from the first run
             note_run(process, status)
     process.restarts = status.restarts
 

@@ -324,10 +324,10 @@ class MasterState:
                 self._update_terminal(process)
 
     def _drop_next_spec(self, process: Process) -> None:
-        """End the replacement of a process that has ended otherwise than for its next start.
+        """End the replacement of a process that ended, but not to be started with its next spec.
 
-        The work that it has done is that of its former version. A cancelled one has done none, and
-        has the new version if it is started again.
+        A completed process has done the work of its former version. A cancelled process has
+        completed none, so it has the new version if it is started again.
         """
         spec, process.next_spec = process.next_spec, None
         if spec is not None and process.phase is ProcessPhase.CANCELLED:

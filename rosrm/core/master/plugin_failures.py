@@ -12,7 +12,7 @@ from rosrm.extensions.plugin_calls import TITLES, Failing, Plugin
 from rosrm.model.event_kinds import EventKind
 from rosrm.wording import sanitized
 
-#: Most failing plugins of a host that count, and most letters of a name or a reason.
+#: Maximum number of failing plugins of a host, and of characters of a name or a reason.
 _MOST_FAILING: Final = 64
 _LONGEST_ERROR: Final = 1000
 

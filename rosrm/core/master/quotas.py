@@ -1,6 +1,6 @@
 """Quotas of users, and the limit of the cluster: on the processes that have not ended.
 
-Every request that starts or changes processes is checked here, against the whole that results.
+Every request that starts or changes processes is checked here, by the resulting total.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ def check_quota(
 ) -> None:  # fmt: skip
     """Refuse processes with which a user would have more than its quota.
 
-    The whole counts that the user would have then, as far as it is known: a process that is
-    replaced counts with the larger needs of both versions.
+    The check uses the total that the user would then have, as far as it is known. A process that is
+    being replaced counts with the larger needs of both versions.
 
     Args:
         specs: new processes, and new versions of others.
@@ -107,7 +107,7 @@ def _claims(
 def _pending(state: MasterState, superseded: AbstractSet[str]) -> Iterator[tuple[str, ProcessSpec]]:
     """Yield the owner and the spec of each process that an application has yet to start or change.
 
-    That is also what it would do if its version failed, and the former one returned.
+    This includes processes that it would start if its version failed and the former one returned.
     """
     for application in state.applications.values():
         is_superseded = application.name in superseded

@@ -1,4 +1,4 @@
-"""Restarts in place: each order is repeated while the run is there for which it was meant.
+"""Restarts in place: each order is repeated until the run for which it was meant has ended.
 
 =================================  =============================================================
 observed                           action
@@ -12,7 +12,7 @@ the same run is still reported     `RestartInstance` again, with back-off, while
 the run has ended before           the process is queued again
 the slave refuses the order, or    the restart is given up, which is recorded; that by a dependency
 its host is lost                   stays due until the host returns
-another instance owns the name     the restart has no object any more
+another instance owns the name     the restart is dropped
 =================================  =============================================================
 """
 
@@ -30,7 +30,7 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import RestartInstance
 from rosrm.model.values import InstanceState, InstanceStatus
 
-#: Reported ends that no fence and no host has caused.
+#: Reported ends other than those by a refusal, a fence or the stop of a slave.
 _ENDS: Final = frozenset({InstanceState.EXITED, InstanceState.FAILED})
 #: Conditions of a host on which a restart is given up.
 _GONE: Final = frozenset({HostCondition.LOST, HostCondition.DETACHED})

@@ -71,7 +71,7 @@ def _review_waiting(state: MasterState, process: Process, now: float) -> None:
 
 
 def _awaited_strays(state: MasterState, process: Process, now: float) -> str:
-    """Return a predicate on instances of its name that hosts report unasked; "": it awaits none.
+    """Return why a process waits for strays of its name, as a predicate; "": it waits for none.
 
     The journal may have lost their assignments, so they may run. But a host may also report them
     falsely, so the wait has an end, which no further report delays.

@@ -132,7 +132,7 @@ def _withdraw(state: MasterState, process: Process, instance: Instance, now: flo
 
 
 def _never_arrived(state: MasterState, instance: Instance, age: float) -> bool:
-    """Return True if an instance does not exist, because its host reports without it for so long.
+    """Return True if an instance does not exist, because its host reports for so long without it.
 
     A slave refuses an assignment that is older than `control.max_age`. A host that is silent, or of
     which a status is missing, may have the instance.

@@ -253,7 +253,7 @@ class TimePassed:
 
 @dataclass(frozen=True, slots=True)
 class Slept:
-    """This machine was suspended, in which no process could do anything."""
+    """This machine was suspended for some seconds, in which no process could run."""
 
     seconds: float
 

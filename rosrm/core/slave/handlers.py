@@ -535,7 +535,7 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
             unseen = f"{node} of this instance was seen in the ROS graph"
             why = components.lateness(held) or unseen
             held.unready = f"not ready within {awaited.timeout:g} s: {why}"
-            held.loading = None  # because an instance that is being stopped becomes ready no more
+            held.loading = None  # because an instance that is being stopped must not become ready
             orders.append(commands.Stop(instance))
         elif held.loading is not None:
             orders += _after(state, held, components.time_passed(held, now), now)
@@ -554,7 +554,7 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
 
 
 def _leave_out(state: SlaveState, event: events.Slept, _now: float) -> _Commands:
-    """Prolong what a process has to do in a time; fences and leases count the suspend."""
+    """Prolong the time limits of processes by a suspend; fences and leases count the suspend."""
     for held in state.held.values():
         if held.ready_by is not None:
             held.ready_by += event.seconds

@@ -168,7 +168,7 @@ class TimePassed(NamedTuple):
 
 
 class Slept(NamedTuple):
-    """This machine was suspended, in which no process could do anything."""
+    """This machine was suspended for some seconds, in which no process could run."""
 
     seconds: float
 

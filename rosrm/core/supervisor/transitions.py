@@ -175,7 +175,7 @@ def _escalate(instance: Instance, event: events.Event, now: float) -> list[Comma
 
 
 def _leave_out(instance: Instance, event: events.Event, now: float) -> list[Command]:
-    """Prolong a grace by a suspend; the time by which a fenced instance must be gone stays."""
+    """Prolong a grace by a suspend, but not the time by which a fenced instance must be gone."""
     assert isinstance(event, events.Slept)
     assert instance.deadline is not None
     instance.stop_began += event.seconds

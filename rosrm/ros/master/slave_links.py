@@ -53,7 +53,7 @@ _FIRST_READING: Final = 1.0
 
 @dataclass(frozen=True, slots=True)
 class _Deferred:
-    """An order for a slave, a request of it or an introduction to it, waiting for a reading.
+    """An order for a slave, a request from it or an introduction to it that waits for a reading.
 
     Attributes:
         deadline: monotonic seconds.

@@ -141,7 +141,7 @@ class Fetch:
         return f"artifact {self.artifact.name!r} was not fetched: {why}"
 
     def stalled(self, now: float) -> str:
-        """Return what a fetch waits for, once a request was not answered in time; "": nothing."""
+        """Return why a fetch stalls, once a request has no answer in time; "": it does not."""
         waits = now - self._progress_at
         return f"{self._silence} ({duration(waits)})" if waits > _ANSWER else ""
 

@@ -1,4 +1,4 @@
-"""Lanes: calls that may hang, off the loop, one after the other in each lane."""
+"""Threads for calls that may hang: the calls of one lane run one after the other."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class _Call:
 class Lanes:
     """Threads of calls that may hang; only the loop uses this object.
 
-    A call that hangs costs its own lane `limit` seconds, and no other lane anything.
+    A call that hangs delays its own lane by `limit` seconds, and no other lane.
 
     Args:
         post: schedules a call in the loop; may be called from any thread.

@@ -36,11 +36,11 @@ _log = logging.getLogger("rosrm.slave")
 PREPARE_LIMIT: Final = 10.0
 #: Seconds for any other call of a launcher, for which the slave's loop waits.
 ASK_LIMIT: Final = 0.5
-#: Most processes of an instance, and the highest pid of a kernel.
+#: Maximum number of processes of an instance, and the highest pid of a kernel.
 MOST_MEMBERS: Final = 32_768
 _HIGHEST_PID: Final = 1 << 22
-#: Most bytes of a command line with its environment: half of what a kernel accepts by default. As
-#: JSON they are shorter than the longest line that a supervisor accepts.
+#: Maximum bytes of a command line with its environment: half of what a kernel accepts by default.
+#: As JSON they are shorter than the longest line that a supervisor accepts.
 MOST_BYTES: Final = 1 << 20
 
 
@@ -208,7 +208,7 @@ class Launchers:
 
         def ask() -> T:
             answer = whole(getattr(launcher, method)(argument), hint, method)
-            if hint is object:  # that is, none is needed
+            if hint is object:  # no answer is expected
                 return otherwise
             pids = answer if isinstance(answer, tuple) else (answer,) if hint is int else ()
             if len(pids) > MOST_MEMBERS:

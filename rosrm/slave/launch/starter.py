@@ -168,7 +168,7 @@ class Starter:
         """
         match command:
             case commands.Renew() | commands.Forget():
-                return False  # of no instance that waits
+                return False  # never about an instance that waits
             case commands.Stop(instance) | commands.Fence(instance):
                 if not self._is_preparing(instance):
                     return False
@@ -184,7 +184,7 @@ class Starter:
             case commands.Restart(instance) | commands.Remember(instance):
                 return self._is_preparing(instance)  # the start follows, with the newest memo
             case commands.Fail(instance):
-                return self._is_preparing(instance)  # no run of it can be meant
+                return self._is_preparing(instance)  # it has no run that the order could mean
             case _:
                 assert_never(command)
         return True
@@ -222,7 +222,7 @@ class Starter:
         self._graph_before.pop(instance, None)
         self._keyless.discard(instance)
         key = key_path(self.supervisor.state, instance)
-        self.paths.run(partial(_remove, key), _ignore, _ignore)  # else it goes with the log
+        self.paths.run(partial(_remove, key), _ignore, _ignore)  # otherwise removed with the log
         self.replication.ended(instance)
 
     def _fetched(self, assignment: Assignment, fault: str) -> None:

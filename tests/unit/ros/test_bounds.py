@@ -55,11 +55,11 @@ def many(kind, count: int):
 @pytest.mark.parametrize(
     ("message", "said"),
     [
-        (msg.MasterBeat(name=65_537 * "n"), "MasterBeat.name has 65537 letters; at most 65536"),
+        (msg.MasterBeat(name=65_537 * "n"), "MasterBeat.name has 65537 characters; at most 65536"),
         (msg.MasterBeat(silent_hosts=65_537 * [1]), "MasterBeat.silent_hosts has 65537 entries"),
         (
             srv.Submit.Request(envelope=msg.Envelope(request_id=65_537 * "x")),
-            "Envelope.request_id has 65537 letters",
+            "Envelope.request_id has 65537 characters",
         ),
         (
             srv.Submit.Request(processes=many(msg.ProcessSpec, 10_001)),
@@ -67,7 +67,7 @@ def many(kind, count: int):
         ),
         (
             srv.Submit.Request(processes=[msg.ProcessSpec(command=[131_073 * "x"])]),
-            "ProcessSpec.command has 131073 letters; at most 131072",
+            "ProcessSpec.command has 131073 characters; at most 131072",
         ),
         (srv.Cancel.Request(processes=[65_537 * "x"]), "Cancel_Request.processes has 65537"),
         (
@@ -78,7 +78,7 @@ def many(kind, count: int):
         ),
         (
             srv.Cancel.Request(processes=1025 * [65_535 * "x"]),
-            f"a Cancel_Request of 67174400 letters; at most {LARGEST_MESSAGE}",
+            f"a Cancel_Request of 67174400 characters; at most {LARGEST_MESSAGE}",
         ),
     ],
 )  # fmt: skip

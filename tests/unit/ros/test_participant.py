@@ -79,4 +79,4 @@ def test_a_message_beyond_its_bounds_costs_only_itself(caplog) -> None:
     for name in ("fine", 65_537 * "n"):
         callback(msg.MasterBeat(name=name))
     assert [one.name for one in taken] == ["fine"]
-    assert "MasterBeat.name has 65537 letters; at most 65536" in caplog.text
+    assert "MasterBeat.name has 65537 characters; at most 65536" in caplog.text

@@ -130,7 +130,7 @@ def test_a_request_beyond_its_bounds_is_answered_with_the_field() -> None:
     service = Service(srv.Cancel, "/rosrm/cancel", lambda request, _: handled.append(request))
     (response,) = service.answers(srv.Cancel.Request(processes=[65_537 * "n"]))
     assert (response.answer.accepted, response.answer.code) == (False, "failed")
-    assert "Cancel_Request.processes has 65537 letters" in response.answer.message
+    assert "Cancel_Request.processes has 65537 characters" in response.answer.message
     assert handled == []
 
 

@@ -46,7 +46,7 @@ CLOSING: Final = 5.0
 #: Most events in one listing; a longer absence leaves out the oldest.
 _MOST_EVENTS: Final = 10_000
 
-#: Most notices that wait in memory for the disk.
+#: Maximum number of notices that wait in memory for the disk.
 MOST_UNSTORED: Final = 10_000
 
 _log = logging.getLogger("rosrm.alerts")

@@ -13,7 +13,7 @@ from rosrm.errors import ConfigError
 from rosrm_web.master_link import Busy
 from rosrm_web.tokens import User, read_tokens
 
-#: Most requests, streams and pages that one user has open.
+#: Maximum number of requests, streams and pages that one user has open.
 MOST_OPEN: Final = 24
 #: Seconds between two looks at the file.
 PERIOD: Final = 1.0
@@ -72,7 +72,7 @@ class Access:
     def check_room(self, user: User) -> None:
         """Refuse one more request or page of a user that leaves no room for others; raises `Busy`.
 
-        Where no tokens are required, all are one user.
+        Where no tokens are required, all requests count for one user.
         """
         if user in self.users and sum(one == user for one, _ in self._open.values()) >= MOST_OPEN:
             raise Busy(f"{user.name} has {MOST_OPEN} requests and pages open; close one first")

@@ -140,8 +140,8 @@ class Connection(H11Protocol):
 def _make_room(new: Connection) -> None:
     """End a connection that waits for its client, or the new one.
 
-    Of those, the oldest one of the address with the most connections ends. So no machine that opens
-    many of them takes the places of others.
+    Among the waiting ones, the oldest one of the address with the most connections ends. So a
+    machine that opens many connections does not displace others.
     """
     known = [one for one in new.connections if isinstance(one, Connection)]
     of_address = Counter(one.address for one in known)

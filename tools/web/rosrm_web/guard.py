@@ -24,7 +24,7 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 #: Most bytes of the body of a request, such as a work file.
 LARGEST_BODY: Final = 4 * 2**20
-#: The same of a request without a token: the form with one.
+#: Maximum bytes of the body of a request without a valid token: the form for the token.
 LARGEST_LOGIN: Final = 4 * 2**10
 #: Seconds for the body of a request.
 BODY_TIMEOUT: Final = 10.0

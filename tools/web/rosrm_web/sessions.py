@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 #: Seconds after which a browser has to give the token again.
 LIFETIME: Final = 12 * 3600.0
-#: Most sessions of one user; a further one ends the oldest.
+#: Maximum number of sessions of one user; a further one ends the oldest.
 MOST_OF_USER: Final = 32
 
 

@@ -219,7 +219,7 @@ def number_of(instance: str) -> int:
 def call_later(seconds: float, do: Callable[..., None], *arguments: Any) -> None:
     """Call a function later, in a thread that does not keep the slave from ending.
 
-    Without a further thread, call it now if it is due, and otherwise leave it to `sweep`.
+    If no thread can be started, call it now if it is due, and otherwise leave it to `sweep`.
     """
 
     def call() -> None:

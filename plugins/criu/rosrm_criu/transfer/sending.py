@@ -30,7 +30,7 @@ from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Offer, OfferResult
 _LOOPBACK: Final = "127.0.0.1"
 #: Seconds for a reader to complete the TLS handshake and to send the token.
 _GREETING: Final = 10.0
-#: Most connections, each with a thread, whose reader is not admitted yet.
+#: Maximum number of connections, each with a thread, whose reader is not admitted yet.
 _MOST_STRANGERS: Final = 16
 #: Seconds of unused time that may be made up at once.
 _SLACK: Final = 0.05

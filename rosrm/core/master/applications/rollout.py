@@ -372,8 +372,8 @@ def _set_wanted(
     ending = [state.processes[name] for name, one in found.items() if one.action is Action.STOP]
     order = dict.fromkeys([one.name for one in dependants_first(state, ending)]) | found
     begun = {name: Task(replaces=found[name].action is Action.REPLACE) for name in order}
-    # Their specs do not differ, but their slaves have not changed them, or have refused it; or a
-    # replacement is being undone, and may still turn.
+    # The specs of these processes do not differ, but their slaves have not made the change yet or
+    # have refused it, or a replacement of them is under way or being undone.
     open_yet = {
         name: Task() for name in application.specs
         if (process := state.processes.get(name)) is not None

@@ -43,7 +43,7 @@ from rosrm.wording import size
 _LOOK_EVERY: Final = 1.0
 #: Time-out of a removal, in seconds.
 _PATIENCE: Final = 30.0
-#: First and longest time, in seconds, after a failure.
+#: First and longest time, in seconds, from a failed dump to the next one.
 _WAITS: Final = (1.0, 600.0)
 
 
@@ -63,7 +63,7 @@ def review(state: MasterState, now: float) -> None:
 
 
 def note_answer(state: MasterState, number: int, event: happened.OrderAnswered, now: float) -> None:
-    """Note the answer to the order of an instance's dump, or to that to remove its images."""
+    """Note the answer to an order to dump an instance, or to remove its images."""
     dumped = state.periodic.of.get(number)
     if dumped is None:
         return

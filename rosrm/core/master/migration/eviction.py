@@ -438,7 +438,8 @@ def _grouped(reasons: Iterable[tuple[str, str]]) -> list[str]:
 def _why_it_stays(state: MasterState, instance: Instance, now: float) -> str:
     """Return why an instance stays on its host; "" if it can move or is about to end.
 
-    It also stays while its moves to all other hosts have failed, until one is tried again.
+    The instance also stays while its moves to all other hosts have failed, until the master tries
+    one again.
     """
     process, source = state.owned_by(instance), instance.host
     if process is None or process.wanted is not DesiredState.RUN:
@@ -474,7 +475,7 @@ def _note_drained(state: MasterState, host: Host, now: float) -> None:
     if not host.drained:
         return
     left = departures(state, host, now)
-    if host.blocked.get("drained") != left:  # what is left may try to leave again
+    if host.blocked.get("drained") != left:  # the remaining processes may try to leave again
         host.blocked["drained"] = left
         message = f"{host.name} is drained: {left}"
         state.record(now, EventKind.HOST_DRAINED, message, host=host.name)

@@ -249,8 +249,8 @@ def _plan(
 def _shift(state: MasterState, planned: PlannedMoves, source: Host, freed: FloatArray) -> Shift:
     """Return planned moves with the loads of their hosts before and after.
 
-    The destination gets what the source is freed from, whatever need has chosen the destination.
-    Otherwise a process could move back at the same load.
+    The same usage is subtracted at the source and added at the destination, whichever need has
+    chosen the destination. Otherwise a process could move back at the same load.
     """
     here, there = columns = [source.column, planned.destination.column]
     capacity, then = state.hosts.capacity, freed.copy()

@@ -36,8 +36,8 @@ from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Configure, HandoffPhase, ReportPhase, Start
 from rosrm.model.values import EMPTY
 
-#: Seconds between a lost standby and the next one; doubled with each one, unless it was ready for
-#: the longest time.
+#: First and longest time, in seconds, between a lost standby and the next one. Each lost standby
+#: doubles it, unless the standby was ready for the longest time.
 _FIRST_WAIT: Final = 2.0
 _LONGEST_WAIT: Final = 60.0
 #: Highest number of standbys that one review starts.
@@ -67,7 +67,7 @@ def _lacks_one(state: MasterState, process: Process, now: float) -> bool:
 def _begin(state: MasterState, process: Process, now: float) -> bool:
     owner = state.instances[process.owner]
     ranking = ranking_of(state, _demand(state, process, owner.host, process.moves.waiting(now)))
-    if ranking.best() < 0:  # rather a host where a standby has failed than no standby
+    if ranking.best() < 0:  # a host where a standby has failed is better than none
         ranking = ranking_of(state, _demand(state, process, owner.host, EMPTY))
     column = ranking.best()
     if column < 0:

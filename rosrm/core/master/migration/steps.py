@@ -114,8 +114,8 @@ def outcome_of(state: MasterState, migration: Migration, step: Step, now: float)
 def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
     """Note the answer to an order of the current step of a migration.
 
-    An answer counts although the order was repeated since: else no step would be done on a link
-    whose answers take longer than `order_retry`.
+    An answer counts even if the order was repeated since. Otherwise no step would complete on a
+    link whose answers take longer than `order_retry`.
 
     The results of executors are arguments of later ones. The answer to the start of a standby is
     ignored, because that order is repeated anyway.

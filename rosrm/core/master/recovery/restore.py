@@ -121,7 +121,7 @@ def _restore_process(state: MasterState, item: Mapping[str, Any], now: float) ->
 def _restored_moment(state: MasterState, item: Mapping[str, Any], wall: float, now: float) -> float:
     """Return a journaled time by this master's clock.
 
-    The clock of the day may have been set since. Its time `wall` counts only if the machine has
+    The wall clock may have been set since. So the unix time `wall` counts only if the machine has
     booted in between, or if another machine wrote the journal.
     """
     at = _moment_of_this_boot(state, item, now)

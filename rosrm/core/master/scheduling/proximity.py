@@ -31,7 +31,7 @@ def keeping_all(table: HostTable, demand: Demand) -> BoolArray | None:
 def keeping(table: HostTable, neighbour: Neighbour) -> BoolArray:
     """Return the mask, (H,), of the hosts that keep a rule.
 
-    None keeps the rule to run apart from an instance by a label that is not known yet.
+    No host keeps a rule `apart` by a label while the label of the other instance's host is unknown.
     """
     if neighbour.relation == "apart" and _unknown_host(table, neighbour):
         return np.zeros(len(table), np.bool_)

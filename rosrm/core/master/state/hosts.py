@@ -32,8 +32,8 @@ from rosrm.model.values import EMPTY, HostDescription, InstanceId, ProcessSpec
 #: An estimated need counts as at most this share of a host's limit. Otherwise an estimate alone
 #: could exclude a process from every host. Declared needs have no such bound.
 _MOST_GUESSED: Final = 0.5
-#: Greatest step from one sequence of a host to the next, beyond those that the time since explains;
-#: a greater one is an error or a forgery.
+#: Largest step from one sequence of a host to the next, beyond the cycles that fit into the time
+#: since; a larger step is an error or a forgery.
 MOST_AHEAD: Final = 1000
 
 #: Shortest period, in seconds, that counts between two readings of a host.

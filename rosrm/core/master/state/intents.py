@@ -124,7 +124,7 @@ def _migration(tables: Tables, migration: Migration, stopping: Sequence[int]) ->
 
 
 def moment(boot: str, at: float) -> list[str | float]:
-    """Return a time of the master's clock, which counts from the boot of its machine, as plain."""
+    """Return a time of the master's clock as JSON values: the id of the boot, and the time."""
     return [boot, at] if isfinite(at) else []
 
 

@@ -18,7 +18,7 @@ from rosrm.extensions.contracts import CheckpointChoice, CheckpointPolicy
 from rosrm.model.description_checks import name_fault
 from rosrm.model.values import EMPTY, SnapshotReport
 
-#: Most snapshots of one host that count.
+#: Maximum number of snapshots of one host that count.
 _MOST_OF_HOST: Final = 10_000
 _IN_REACH: Final = frozenset({HostCondition.UP, HostCondition.SUSPECT})
 
