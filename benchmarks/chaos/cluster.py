@@ -41,7 +41,7 @@ _MEMORY: Final = 2 * GIB
 _DISK: Final = 96 * MIB
 #: Seconds after which the service manager restarts a part that has ended unexpectedly.
 _AGAIN: Final = 1.0
-#: Most runs of the master whose records are kept.
+#: Maximum number of runs of the master whose records are kept.
 _MOST_RECORDS: Final = 1000
 #: Seconds for parts to shut down.
 _END: Final = 30.0

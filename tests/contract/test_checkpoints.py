@@ -55,7 +55,7 @@ def test_apart_comes_first():
 
 
 def test_a_host_without_the_label_is_not_known_to_be_apart():
-    """A missing label is no other value."""
+    """A host without the label does not count as one with another value."""
     bare = {f"x{n}": {} for n in range(9)}
     assert choose(view(hosts={**bare, **HOSTS}), apart_by="rack").hosts[0] in HOSTS
 

@@ -1,4 +1,4 @@
-"""What arrives before any key is checked: envelopes, readings, names of principals and tickets."""
+"""Decoders that run before any key is checked: envelopes, readings, principals, tickets."""
 
 from __future__ import annotations
 

@@ -75,7 +75,7 @@ def test_without_the_right_it_stays_where_it_is(missing):
 
 
 def test_up_without_a_loopback_address_says_so_at_once():
-    """Otherwise `rosrm up` would wait for its own master without a word."""
+    """Otherwise `rosrm up` would wait for its own master without a message."""
     command = ["unshare", "--net", sys.executable, "-m", "rosrm.cli", "up"]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     if ran.returncode == 1 and "unshare" in ran.stderr:

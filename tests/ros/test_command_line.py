@@ -303,7 +303,7 @@ def test_following_ends_when_its_reader_has_gone(rosrm, words, says) -> None:
 
 
 def test_a_line_without_an_end_is_shown_in_a_terminal(rosrm, cluster) -> None:
-    """Such as a prompt; the rest of the line follows it."""
+    """`logs -f` shows an unfinished line, such as a prompt, and later the rest of the line."""
     go = rosrm.directory / "answered"
     work = rosrm.file(
         "asks.yaml",
@@ -377,7 +377,7 @@ def test_top_can_be_stopped_and_continued(rosrm) -> None:
 
 
 def test_a_command_in_a_removed_directory_works(rosrm, tmp_path) -> None:
-    """The command and its libraries have relative search paths, which lead nowhere."""
+    """The command works although relative search paths of its libraries lead nowhere."""
     gone = tmp_path / "gone"
     gone.mkdir()
     script = 'cd "$0"; rmdir "$0"; exec "$1" ps'

@@ -1,7 +1,7 @@
 """Moves of the examples as real processes: in Python, and in C++ where rclcpp is installed.
 
-The tests of the protocol run the core of `rosrm_node_cpp` under an adapter in Python; here it runs
-with rclcpp.
+The tests of the protocol run the core of `rosrm_node_cpp` under an adapter in Python; in these
+tests the core runs with rclcpp.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Files of all parts: none is for others, also where the caller has no umask."""
+"""Files of all parts: other users can read none, even if the caller has no umask."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def no_umask():
 
 @pytest.mark.usefixtures("no_umask")
 def test_no_file_of_state_is_readable_by_others(make_cluster) -> None:
-    """Journal, keys, logs, records and sockets of master, slave and supervisor."""
+    """Other users can open no journal, key, log, record or socket of master, slave, supervisor."""
     cluster = make_cluster(host("h0"))
     cluster.run(python("p", "print(1)", kind=Kind.JOB))
     cluster.submit(python("q", "import time; time.sleep(600)"))

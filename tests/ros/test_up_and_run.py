@@ -166,7 +166,7 @@ def test_a_job_of_the_command_line(make_cluster, tmp_path) -> None:
 
 
 def test_a_terminal_that_lacks_a_character_ends_nothing(terminal) -> None:
-    """The reason of anybody's job may have it; each command shows its number."""
+    """Each command shows the number of a character that the terminal lacks, and continues."""
     terminal.environment["PYTHONIOENCODING"] = "iso8859-1"
     work = terminal.file("arrow.yaml", "processes: [{name: odd, kind: job, command: [no→such]}]")
     with terminal.start("up", work, start_new_session=True) as process:
@@ -185,7 +185,7 @@ def test_a_terminal_that_lacks_a_character_ends_nothing(terminal) -> None:
 
 
 def test_processes_without_a_supervisor_are_ended(terminal) -> None:
-    """Nothing was left to stop them, and `rosrm up` looks before it says that nothing runs."""
+    """`rosrm up` ends processes whose supervisor was killed before it reports that none runs."""
     with started(terminal) as (process, _):
         pids = [row["pid"] for row in terminal.json("ps")]
         parts = psutil.Process(process.pid).children(recursive=True)

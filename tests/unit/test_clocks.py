@@ -8,7 +8,7 @@ from rosrm import clocks
 
 
 def test_each_suspend_counts_once(monkeypatch):
-    """A moment between two reads of the clocks is no suspend."""
+    """Each suspend is reported once; the time between two reads of the clocks is no suspend."""
     slept = [100.0]
     monkeypatch.setattr(clocks, "suspended_time", lambda: slept[0])
     suspends = clocks.Suspends()

@@ -155,7 +155,7 @@ def test_the_next_supervisor_ends_an_expired_instance(host, client):
 
 
 def test_after_a_restart_of_the_machine_it_is_not_started(host, client):
-    """The length of the outage is unknown, so a successor may run elsewhere: no restart.
+    """The process is not restarted: the outage may have been long, and a successor may run.
 
     That holds also for a fence that is longer than the machine runs.
     """

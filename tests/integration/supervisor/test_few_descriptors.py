@@ -61,7 +61,7 @@ def talks(host, client):
 
 
 def test_exit_codes_arrive_later(host, client, talks):
-    """An end is noticed, but the other processes of its instance cannot be looked for yet."""
+    """The supervisor notices an end, but cannot look for other processes of the instance yet."""
     with no_descriptors(client.pid):
         for pid in talks.values():
             os.kill(pid, signal.SIGUSR1)
@@ -79,7 +79,7 @@ def test_exit_codes_arrive_later(host, client, talks):
 
 
 def test_the_end_of_a_process_taken_over_arrives_later(host, client):
-    """Its pidfd reports the end once only."""
+    """The end is not lost although the pidfd reports it only once."""
     pid = host.sleeper(client, "sleeps", restart=RestartPolicy("never"))
     client = host.replace_supervisor(client)
     with no_descriptors(client.pid):
@@ -89,7 +89,7 @@ def test_the_end_of_a_process_taken_over_arrives_later(host, client):
 
 
 def test_starts_are_tried_again(host, client):
-    """Each of the starts has an outcome: it fails now, and its policy tries it again."""
+    """Each start fails for now, and its restart policy tries it again."""
     restart = RestartPolicy("on-failure", delay=0.05, attempts=1000)
     with no_descriptors(client.pid):
         client.start([host.order(f"again{n}", "true", restart=restart) for n in range(9)])

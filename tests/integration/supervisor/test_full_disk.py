@@ -58,7 +58,7 @@ def test_a_supervisor_starts_on_a_full_disk(disk, host):
 
 
 def test_lines_that_cannot_be_written_are_counted(monkeypatch):
-    """A report of a failure must not need what is missing; the next line says what was lost."""
+    """The log of the supervisor counts lines that find no room; the next line gives the number."""
     written, full = [], [True]
 
     def write(_file, data):

@@ -1,4 +1,4 @@
-"""A file system that does not answer costs the process that names it, and no other one."""
+"""A file system that does not answer delays only the process that names a path on it."""
 
 from __future__ import annotations
 

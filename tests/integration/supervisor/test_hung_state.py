@@ -1,4 +1,4 @@
-"""A state directory or log folder that does not answer costs new starts, and nothing that runs."""
+"""A state directory or log folder that does not answer: only new starts fail."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_fence_acts_while_the_directory_hangs(host, hung):
 
 
 def test_a_shutdown_ends_and_another_supervisor_may_follow(host, hung):
-    """All processes are ended, and the slave hears of it."""
+    """The supervisor ends all processes, and reports that to the slave."""
     client = host.connect()
     pid = host.sleeper(client, "runs")
     hung.hang()

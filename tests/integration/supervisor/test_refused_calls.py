@@ -26,7 +26,7 @@ LEAVES = "(trap '' INT; exec sleep 1000) & echo $! > child; exit 0"
 
 @pytest.mark.parametrize("error", [errno.EPERM, errno.ENOSYS])
 def test_ends_of_processes_that_were_taken_over_are_found(host, error):
-    """Without a pidfd the supervisor looks for them; formerly it ended, again and again."""
+    """Without a pidfd the supervisor looks for the processes in /proc, and does not end."""
     first = host.connect()
     pid = host.sleeper(first, "sleeps", restart=RestartPolicy("always", delay=0.01))
     host.kill_supervisor(first)
@@ -38,7 +38,7 @@ def test_ends_of_processes_that_were_taken_over_are_found(host, error):
 
 
 def test_processes_that_a_leader_leaves_are_stopped(host):
-    """They are no children of the supervisor's choice, and have no pidfd either."""
+    """The supervisor has not started these processes, and has no pidfd of them either."""
     client = without_calls(host.connect, *ALL)
     client.start([host.order("leaves", "sh", "-c", LEAVES)])
     assert host.ended(client, "leaves").state is InstanceState.EXITED

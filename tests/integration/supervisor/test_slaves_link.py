@@ -223,7 +223,7 @@ def test_the_shutdown_reaches_one_that_is_just_taking_over(loop) -> None:
 
 
 def test_a_slave_that_can_receive_no_more_ends_with_the_reason(loop, monkeypatch) -> None:
-    """A fault in the receiving thread would leave a slave that no process can report to."""
+    """After a fault in its receiving thread, a slave would get no reports of any process."""
 
     def fail(*_, **__):
         raise RuntimeError("a bug")

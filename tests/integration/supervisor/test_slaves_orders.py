@@ -128,7 +128,7 @@ def test_a_path_that_hangs_refuses_one_process(slave, hung, kind):
 
 
 def test_a_start_that_waits_for_a_path_is_called_off(slave, hung):
-    """The outcome of the thread is ignored."""
+    """The start is cancelled at once, and the later outcome of its thread is ignored."""
     slave.launch(spec_of("parameters", hung.place))
     assert [one.instance.process for one in slave.starter.preparing()] == ["waits"]
     assert slave.starter.call_off(commands.Stop(InstanceId("waits", 1)))
@@ -137,7 +137,7 @@ def test_a_start_that_waits_for_a_path_is_called_off(slave, hung):
 
 
 def test_a_fifo_is_no_parameter_file(slave, tmp_path):
-    """Its writer may never come."""
+    """A FIFO is refused, because a read would wait for a writer, perhaps for ever."""
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     sources = (ParameterSource(file=str(fifo)),)
@@ -177,7 +177,7 @@ def test_a_start_for_which_no_thread_is_left_is_refused(slave, monkeypatch):
 
 
 def test_a_file_operation_without_a_thread_fails(monkeypatch):
-    """Later ones get their thread, and do not wait behind it."""
+    """Later operations get their thread, and do not wait behind the failed one."""
     posted: queue.Queue = queue.Queue()
     worker, seen = Worker("test", posted.put), []
     with monkeypatch.context() as without:

@@ -238,7 +238,7 @@ def test_a_long_header_is_refused_before_it_is_read(tmp_path, kind):
 
 @pytest.mark.parametrize("version", ["1.0", "0.1", "0.0"])
 def test_the_map_of_a_sparse_file_is_not_read(tmp_path, version):
-    """Its length is that of the archive, and not that of a header."""
+    """The map of a sparse file may be as long as the archive, so it is not read."""
     major, minor = version.split(".")
     records = {"GNU.sparse.major": major, "GNU.sparse.minor": minor, "GNU.sparse.name": "content"}
     if version == "0.1":
@@ -253,7 +253,7 @@ def test_the_map_of_a_sparse_file_is_not_read(tmp_path, version):
 
 
 def test_the_blocks_of_an_old_sparse_header_are_not_read(tmp_path):
-    """Each one can announce another one."""
+    """A chain of header blocks, each of which announces another one, is refused."""
     header = bytearray(entry("content", tarfile.GNUTYPE_SPARSE).tobuf(tarfile.GNU_FORMAT))
     header[482] = 1
     header[148:156] = b"%06o\0 " % (256 + sum(header[:148]) + sum(header[156:512]))
@@ -276,7 +276,7 @@ def test_many_entries_with_long_headers_take_little_memory(tmp_path):
 
 
 def test_headers_that_only_announce_headers_are_refused(tmp_path):
-    """A chain of them ends with the archive."""
+    """A chain of headers that announce headers could be as long as the archive."""
     header = entry("content", tarfile.GNUTYPE_LONGNAME, size=1).tobuf(tarfile.GNU_FORMAT)
     path = tmp_path / "any.tar"
     path.write_bytes((header[:512] + b"x".ljust(512, b"\0")) * 20_000)

@@ -103,7 +103,7 @@ def test_no_sender_spoils_the_upload_of_another(store):
 
 
 def test_no_user_takes_the_uploads_of_others(store):
-    """Runs of one principal share a bound; another principal may still begin."""
+    """The runs of one principal share a bound; another principal may still begin an upload."""
     most = bound_of(Store.UPLOADS, is_operator=False).number
     for number in range(most):
         store.take(f"user:eve {number}", data_of(number)[0], 10, 0, b"", keep=NONE)

@@ -1,4 +1,4 @@
-"""`rosrm adopt` ends, whatever does not answer."""
+"""`rosrm adopt` ends although a host, a process or a file does not answer."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_an_adoption_that_does_not_happen_is_waited_for_in_vain_only_so_long(
 
 
 def test_a_look_that_the_kernel_holds_is_left_to_itself():
-    """A process or a file on a dead disk holds the command for its time-out alone."""
+    """A process or a file on a dead disk blocks the command only for its time-out."""
     held = threading.Event()
     with pytest.raises(
         RosrmError, match=r"the inspection of process 7 has not ended within 0\.05 s"
@@ -44,7 +44,7 @@ def test_a_look_that_the_kernel_holds_is_left_to_itself():
 
 
 def test_a_refusal_reaches_the_caller_of_a_bounded_look():
-    """An error of the call is the caller's, as without the time-out."""
+    """The caller gets an error of the call, as without the time-out."""
 
     def refuse():
         raise Refused("no process 7 runs")

@@ -32,7 +32,7 @@ class Master:
 
 
 def test_a_refusal_is_retried_as_a_silence_is(tmp_path, capsys):
-    """The collection of days must not end because a master was busy for a moment."""
+    """A collection that has run for days must not end because a master was busy for a moment."""
     stop = threading.Event()
     Collecting(Collector(stop), tmp_path, stop, Master).run(0.01)
     said = capsys.readouterr().err
@@ -41,7 +41,7 @@ def test_a_refusal_is_retried_as_a_silence_is(tmp_path, capsys):
 
 
 def test_a_refusal_of_the_first_connection_ends_the_command(tmp_path):
-    """The user is there to read it, as with a master of another version."""
+    """The command ends, because the user can read the refusal, e.g. of another version."""
 
     def refuse():
         raise Refused("another version", "version")

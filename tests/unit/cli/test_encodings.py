@@ -18,7 +18,7 @@ from rosrm.errors import Refused
 from rosrm.model.rows import Listing
 from tests.unit.cli.conftest import PLUGINS, STORY, event, host, process
 
-#: An arrow, letters of other scripts, a symbol beyond 16 bits, and half of a pair.
+#: An arrow, letters of other scripts, a symbol beyond 16 bits, and a lone surrogate.
 FOREIGN = "a → é 東京 😀 \ud800"
 ENCODINGS = ("ascii", "iso8859-1", "cp437", "utf-8")
 
@@ -42,7 +42,7 @@ class Output(io.TextIOWrapper):
     "command", ["ps", "hosts", "plugins", "events", "status", "top -n 1", "explain talker"]
 )
 def test_every_listing_is_shown_in_every_encoding(rosrm, client, command, charset):
-    """One character in the reason of anybody's job is an error of no reader."""
+    """A character that the terminal lacks, in the reason of any job, breaks no listing."""
     client.processes = [process("talker", "failed", reason=FOREIGN), process("other")]
     client.hosts = [host("alpha")]
     client.plugins = [replace(PLUGINS[0], reason=FOREIGN, state="failing")]
@@ -72,7 +72,7 @@ def test_the_columns_of_tables_stay_aligned(encoding, letter):
 
 @in_each_encoding
 def test_the_colours_of_a_cell_stay_at_their_words(encoding):
-    """A state after a name with a long number is coloured, and no part of the number."""
+    """The colour of a state stays at the state, also after a name with a long number."""
     with redirect_stdout(Output(encoding)):
         made = tables.table("NAME")
         made.add_row(Text("→ ").append("failed", "red"))
@@ -101,7 +101,7 @@ def test_output_of_a_process_in_a_terminal_has_the_encoding_of_the_terminal(enco
 
 @in_each_encoding
 def test_what_nobody_checked_is_written_too(encoding):
-    """Help, and the texts of libraries, which print to the standard streams themselves."""
+    """The streams accept help texts, and texts that libraries print to them."""
     with redirect_stdout(Output(encoding)) as stdout:
         never_fail()
         print(FOREIGN)

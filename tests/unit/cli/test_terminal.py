@@ -11,7 +11,7 @@ from rosrm.cli.output.terminal import Terminal
 
 
 def test_a_terminal_that_has_gone_does_not_replace_the_end_of_the_view():
-    """The window was closed: the exit code is that of the signal."""
+    """After the window was closed, the exit code is that of the signal."""
     master, slave = pty.openpty()
 
     def view():

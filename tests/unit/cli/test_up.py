@@ -121,7 +121,7 @@ def test_after_a_fault_the_first_signal_already_hurries():
 
 
 def test_a_missing_temporary_directory_is_said(monkeypatch, tmp_path):
-    """The disk may be full or read-only; the message names the option that helps."""
+    """If the disk is full or read-only, the message names the option that helps."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
     with pytest.raises(ConfigError, match=r"no temporary directory for the state: .*--state DIR"):
         up._temporary_directory()

@@ -60,7 +60,7 @@ def test_a_process_of_another_user_is_named_and_hides_no_other(tmp_path, monkeyp
 
 
 def test_a_killed_cleaner_does_not_replace_the_error_of_an_ended_part(tmp_path, monkeypatch):
-    """The word that keeps the directory finds no reader; the user still gets the first error."""
+    """The message to the killed cleaner fails; the user still gets the first error."""
     programs = []
 
     class Noted(subprocess.Popen):

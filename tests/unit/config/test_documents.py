@@ -103,7 +103,7 @@ def test_a_file_that_is_too_large_is_refused_at_once(tmp_path):
 
 
 def test_a_file_of_too_many_values_is_not_read_to_its_end(monkeypatch):
-    """The rest is not even valid."""
+    """The file is refused before its rest is read, which is not valid YAML."""
     monkeypatch.setattr("rosrm.config.documents.MOST_VALUES", 100)
     said = refusal("- 1\n" * 300 + "[")
     assert "f.yaml:20" in said

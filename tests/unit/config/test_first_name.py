@@ -1,4 +1,4 @@
-"""The name of a host that its file does not name survives another name of its machine."""
+"""A host without a name in its file keeps its name if its machine is renamed."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def started(settings: HostConfig) -> str:
 
 @pytest.mark.parametrize("text", ["", "state: here"])
 def test_a_renamed_machine_keeps_its_host(machine, file, text) -> None:
-    """Host and state directory are those of the first start; the change is said."""
+    """Host and state directory are those of the first start, and a note names the change."""
     first = load_host(file(text))
     assert (first.host, started(first)) == ("first", "")
     machine.host = "second"

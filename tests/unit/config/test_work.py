@@ -670,7 +670,7 @@ def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
     ],
 )
 def test_what_only_a_shell_would_do_with_a_command_is_refused(refusal, text, said):
-    """The program would get other words than the user means; a remedy is given."""
+    """The program would get other words than the user means; the error names a remedy."""
     message = refusal(load_work, f"processes:\n  - name: a\n    command: {text}")
     assert said in message
     assert "Write [bash, -c, " in message or "Write it on one line" in message
@@ -805,7 +805,7 @@ def test_what_every_host_would_refuse_is_refused_before(refusal, keys, said):
 
 @pytest.mark.parametrize("text", ["/x:$PYTHONPATH", "/x:${PYTHONPATH}", "$PYTHONPATH"])
 def test_a_variable_that_only_a_shell_replaces_is_refused(refusal, text):
-    """The program would search a directory of that name; there is a way to extend a variable."""
+    """The program would search a directory named `$NAME`; the error names `{env.NAME}`."""
     entry = f"{{name: a, command: x, environment: {{PYTHONPATH: '{text}'}}}}"
     said = refusal(load_work, f"processes: [{entry}]")
     assert "no shell reads it. Write {env.PYTHONPATH} for the value" in said
@@ -821,6 +821,6 @@ def test_a_variable_of_the_host_stands_in_variables_only(file, refusal):
 
 
 def test_a_home_in_the_first_argument_is_refused_too(refusal):
-    """No argument may have one; the host replaces a home in the program alone."""
+    """No argument may have a `~`, because the host replaces it only in the program."""
     said = refusal(load_work, "processes: [{name: a, module: m, arguments: ~/maps}]")
     assert "'~' outside quotes" in said

@@ -387,7 +387,7 @@ def test_a_process_in_back_off_waits_for_no_other_replacement() -> None:
 
 
 def test_a_stateful_process_waits_for_room_and_a_stateless_one_is_stopped_first() -> None:
-    """Where no host has room for both instances, no state is lost."""
+    """No state is lost if no host has room for both instances."""
     big = 8_000
     cluster = Cluster("a", "b")
     parts = [stateful("p", memory=big), movable("q", memory=big)]
@@ -469,7 +469,7 @@ def test_the_same_request_in_the_middle_changes_nothing() -> None:
 
 
 def test_the_same_request_does_not_forget_a_replacement_that_has_begun() -> None:
-    """What is replaced when the request is repeated is watched as well."""
+    """The master also watches the processes that a repeated request replaces."""
     cluster = Cluster("a")
     parts = [movable("p"), movable("q")]
     cluster.apply("nav", *parts)
@@ -484,7 +484,7 @@ def test_the_same_request_does_not_forget_a_replacement_that_has_begun() -> None
 
 
 def test_a_user_may_cancel_a_process_while_it_is_replaced() -> None:
-    """It does not start with its new program."""
+    """The process does not start with its new program."""
     cluster = Cluster("a")
     cluster.machines["a"].stubborn.add("p")
     cluster.apply("nav", process("p"))
@@ -558,7 +558,7 @@ def test_a_version_that_fails_is_given_up() -> None:
 
 
 def test_a_return_starts_no_process_that_was_cancelled_since() -> None:
-    """The return starts a process that the failed version did not have."""
+    """The return starts `r`, which the failed version did not have, but not the cancelled `q`."""
     cluster = Cluster("a")
     cluster.apply("nav", process("p"), process("q"), process("r"))
     cluster.wait(1.0)
@@ -589,7 +589,7 @@ def test_a_return_starts_what_the_failed_version_has_ended() -> None:
 
 @pytest.mark.parametrize("other", ["a single process", "another user's"])
 def test_a_return_takes_no_process_of_somebody_else(other: str) -> None:
-    """It waits for the name, which was free for a while, and uses it then."""
+    """The process waits for the name, which was free for a while, and then uses it."""
     cluster = Cluster("a")
     cluster.apply("nav", process("p"), movable("q"), by=ADA)
     cluster.wait(1.0)
@@ -656,7 +656,7 @@ def failed_return() -> Cluster:
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_failed_return_of_a_process_is_tried_again(restarted: bool) -> None:
-    """Else the version that was given up would run until somebody applies again."""
+    """Otherwise the version that was given up would run until the next `apply`."""
     cluster = failed_return()
     if restarted:
         cluster.restart_master()
@@ -675,7 +675,7 @@ def test_a_return_that_fails_again_and_again_is_tried_less_and_less() -> None:
 
 
 def test_a_process_that_is_cancelled_after_its_failed_return_does_not_start_again() -> None:
-    """The process has nothing to return to any more."""
+    """The master no longer tries to return a cancelled process to another version."""
     cluster = failed_return()
     cluster.machines["a"].refuses.clear()
     cluster.cancel("p")
@@ -685,7 +685,7 @@ def test_a_process_that_is_cancelled_after_its_failed_return_does_not_start_agai
 
 
 def test_a_version_of_which_a_process_is_replaced_again_is_one_to_return_to() -> None:
-    """The process came back with a lost host, or its return had failed."""
+    """A process may run another version because its lost host returned, or its return failed."""
     cluster = Cluster(Machine("a", stubborn={"p"}))
     cluster.apply("nav", process("p"))
     cluster.wait(3.0)
@@ -1100,7 +1100,7 @@ def test_a_plan_names_each_action_with_its_host_and_changes_nothing() -> None:
 
 
 def test_a_plan_shows_a_return_to_the_former_version() -> None:
-    """Where the new version of a process can never run, the old one is not stopped for it."""
+    """The master does not stop an old version if the new version can never run."""
     cluster = Cluster("a")
     cluster.apply("nav", movable("p"))
     cluster.wait(2.0)
@@ -1172,7 +1172,7 @@ class Fetching(Machine):
 
 @pytest.mark.parametrize("hosts", ["a", "ab"])
 def test_a_change_in_place_reaches_a_start_that_waits_for_files(hosts) -> None:
-    """The fetch goes on where it is, and the process starts with the new policy."""
+    """The fetch continues, and the process starts with the new policy."""
     cluster = Cluster(*(Fetching(host) for host in hosts))
     cluster.apply("app", process("p"))
     (instance,) = cluster["p"].instances

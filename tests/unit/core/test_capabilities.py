@@ -133,7 +133,7 @@ def test_a_host_without_the_capability_is_no_destination():
 
 
 def test_a_host_on_which_the_check_failed_is_checked_again() -> None:
-    """One fault of a moment does not exclude the host until its slave restarts; it is told once."""
+    """A short fault does not exclude the host until its slave restarts; one event records it."""
     there = busy("b")
     there.facts = RuntimeError("no memory left")
     cluster = frozen(Host("a"), there)

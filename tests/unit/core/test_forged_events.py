@@ -265,7 +265,7 @@ HUGE = "x" * 60_000
     ids=lambda texts: next(iter(texts)),
 )
 def test_the_description_of_a_host_is_bounded(texts: dict[str, Any]) -> None:
-    """A registration has at most 64 KiB of texts; each listing of hosts has a part of them."""
+    """A registration has at most 64 KiB of texts; listings have parts of these texts."""
     cluster = Cluster()
     description = replace(Machine("a", incarnation=5).description(), **texts)
     reply = cluster.ask(happened.HostRegistered, description, ())

@@ -360,7 +360,7 @@ def test_an_assigned_process_stays_in_its_gang_over_a_restart_of_the_master() ->
 
 
 def test_a_waiting_process_can_get_another_gang() -> None:
-    """It leaves the former one, and waits for the other: by a change in place."""
+    """A change in place moves a process from its former gang to the other one, and it waits."""
     cluster = cluster_of("a")
     other = [process(f"o{i}", memory=300 * (1 + i), together="other") for i in range(3)]
     alone = process("alone", memory=300)
@@ -411,7 +411,7 @@ def preempted(cluster: Cluster, name: str) -> int:
 def test_no_process_makes_room_for_a_gang_that_cannot_be_placed_as_a_whole(
     preemption: str,
 ) -> None:
-    """The other process of the gang has room nowhere, whoever leaves."""
+    """The other process of the gang fits on no host, whichever process leaves."""
     cluster = cluster_of("abc", preemption=preemption).with_processes(
         process("vital", memory=700, priority=9), process("too", memory=700, priority=9),
         movable("low", memory=300),

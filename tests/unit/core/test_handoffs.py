@@ -109,7 +109,7 @@ def test_a_handoff_without_faults_publishes_each_phase_once() -> None:
 
 
 def test_a_step_is_done_although_its_order_was_repeated_before_the_answer() -> None:
-    """On a link whose answers take longer than `order_retry`, the newest order has none yet."""
+    """On a link whose answers take longer than `order_retry`, the newest order is unanswered."""
     cluster = two_hosts(order_retry=2.0)
     late: list[tuple[float, happened.OrderAnswered]] = []
     for machine in cluster.machines.values():

@@ -1,4 +1,4 @@
-"""An operator's kill of processes: it ends, whatever the processes and their specs delay."""
+"""An operator's kill of processes ends, whichever delays the processes and their specs cause."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def kill(cluster: Cluster, *names: str) -> Reply:
     ],
 )  # fmt: skip
 def test_a_process_that_would_stop_too_late_is_refused(stop: StopPolicy) -> None:
-    """Submissions and applications alike; 10 minutes are allowed."""
+    """Submissions and applications with a stop of more than 10 minutes are refused."""
     cluster = Cluster("a")
     for reply in (
         cluster.submit(process("p", stop=stop)),
@@ -70,7 +70,7 @@ def test_a_kill_is_repeated_as_a_kill() -> None:
 
 
 def test_a_kill_is_a_kill_after_a_restart_of_the_master() -> None:
-    """The next master does not grant the graces of the stop either."""
+    """The next master does not wait for the graces of the stop either."""
     cluster = stubborn(process("p"))
     cluster.cut("a")
     kill(cluster, "p")
@@ -82,7 +82,7 @@ def test_a_kill_is_a_kill_after_a_restart_of_the_master() -> None:
 
 
 def test_a_kill_does_not_wait_for_dependants_after_a_restart_of_the_master() -> None:
-    """The dependant is being stopped, and takes its time."""
+    """The dependant is still being stopped when the process is killed."""
     after = process("after", start_order=StartOrder(after={"p": "ready"}))
     cluster = stubborn(process("p"), after)
     cluster.wait(1.0)
@@ -96,7 +96,7 @@ def test_a_kill_does_not_wait_for_dependants_after_a_restart_of_the_master() -> 
 
 
 def test_a_process_that_is_restarted_after_a_kill_is_stopped_with_its_graces() -> None:
-    """Only the cancellation was by force."""
+    """The kill was meant only for the earlier cancellation."""
     cluster = Cluster("a").with_processes(process("p"))
     kill(cluster, "p")
     cluster.settle()
@@ -135,7 +135,7 @@ def test_a_kill_ends_all_instances_of_a_migration() -> None:
 
 
 def test_a_kill_of_a_queued_or_ended_process_is_a_cancellation() -> None:
-    """Nothing of it runs."""
+    """Such a process has no instance to kill, so it is only cancelled."""
     cluster = stubborn(process("p"), process("q", memory=10**9))
     cluster.cancel("p")
     assert kill(cluster, "q", "p").accepted

@@ -77,7 +77,7 @@ def test_the_age_of_a_phase_is_not_that_of_a_clock_that_was_set(seconds: float) 
 
 @pytest.mark.parametrize("boot", ["another", ""])
 def test_after_a_boot_the_age_of_a_phase_is_that_of_the_clock_of_the_day(boot: str) -> None:
-    """The boot clock has begun again, or its boot is not known."""
+    """The boot clock began at zero again, or the boot of the journal is not known."""
     cluster = Cluster("a").with_processes(process("p"))
     since = cluster["p"].since
     cluster.clock_set_by = 3600.0
@@ -87,7 +87,7 @@ def test_after_a_boot_the_age_of_a_phase_is_that_of_the_clock_of_the_day(boot: s
 
 
 def test_the_age_of_a_move_is_not_that_of_a_clock_that_was_set() -> None:
-    """The record of the move has its seconds."""
+    """The event of the move has its duration, measured without the unix time."""
     cluster = Cluster("a", "b").with_processes(movable("p"))
     cluster.wait(60.0)
     (source,) = cluster.where("p")

@@ -624,7 +624,7 @@ def test_a_move_has_the_options_of_its_process() -> None:
 
 
 def test_a_plan_with_a_text_that_no_message_can_hold_is_unsound() -> None:
-    """An order with half of a character could never be sent, also after a start of the master."""
+    """An order with a lone surrogate could never be sent, even after a restart of the master."""
 
     def odd(move: Move) -> Plan:
         there = move.destination, move.destination_host, 5.0

@@ -109,7 +109,7 @@ def test_a_mode_changes_the_parameters_of_an_application() -> None:
 
 
 def test_a_plan_of_a_switch_changes_nothing() -> None:
-    """It lists what the switch would do."""
+    """The plan lists the actions of the switch."""
     cluster = in_mode("exploring", EXPLORING, DOCKED)
     planned = switch(cluster, "docked", plan=True)
     assert actions(planned) == {"charger": "start", "mapper": "stop"}
@@ -217,7 +217,7 @@ def with_a_waiting_process() -> Cluster:
 
 
 def test_a_wait_before_the_switch_is_no_fault_of_the_mode() -> None:
-    """The new mode stops a process, whose room ends the wait of another one."""
+    """The new mode stops a process, and another process that has waited gets its room."""
     cluster = with_a_waiting_process()
     assert cluster.phase("planner") == "queued"
     (host,) = cluster.where("mapper")
@@ -273,7 +273,7 @@ def test_a_switch_that_fails_returns_to_the_mode_that_was_in_force(restarted: bo
 
 
 def test_a_mode_that_was_never_in_force_is_not_returned_to() -> None:
-    """The first mode failed, and so does the second one: there is no mode before."""
+    """The first mode failed, and the second one fails, too, so there is no mode to return to."""
     modes = [Mode(name, (target(name, process(f"p_{name}")),)) for name in ("one", "two")]
     cluster = Cluster("a")
     load(cluster, *modes)
@@ -383,7 +383,7 @@ def unreached() -> Cluster:
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_mode_is_reached_later_if_its_condition_still_holds(restarted: bool) -> None:
-    """All hosts were away when it began to hold; it is recorded once that the mode must wait."""
+    """All hosts were lost when the condition began to hold; one event records the wait."""
     cluster = unreached()
     if restarted:
         cluster.restart_master()
@@ -395,7 +395,7 @@ def test_a_mode_is_reached_later_if_its_condition_still_holds(restarted: bool) -
 
 
 def test_a_switch_ends_the_tries_to_reach_another_mode() -> None:
-    """The operator has decided, while the condition of the other mode holds."""
+    """The decision of an operator counts although the condition of the other mode holds."""
     cluster = unreached()
     cluster.reconnect("a", seconds=0.1)
     assert cluster.state.modes.retries

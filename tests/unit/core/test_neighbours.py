@@ -447,7 +447,7 @@ def two_in_a_rack(cluster: Cluster) -> tuple[str, str]:
 
 
 def test_a_restart_of_the_master_keeps_the_labels_of_a_host_that_reports_late() -> None:
-    """They are in the journal, also while the host is lost."""
+    """The journal has the labels, also while the host is lost."""
     cluster = cluster_of("abc", process("db1", 300), lease=5.0)
     on, other = two_in_a_rack(cluster)
     cluster.machines[on].connected = False

@@ -1,4 +1,4 @@
-"""One amount in a comparison: what is measured for a moment, or for a failed run, is no need."""
+"""Comparisons by one amount: usage of a short or failed run does not lower the needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.unit.core.cluster import GIB, Cluster, Machine, job, movable, process
 
 @pytest.mark.parametrize("need", ["measured", "declared"])
 def test_a_process_does_not_move_to_and_fro_at_a_constant_load(need: str) -> None:
-    """Whatever need chooses its destination, both hosts are compared by its usage."""
+    """Both hosts are compared by the usage of the process, whichever need chooses one."""
     machines = [Machine(name, memory=10 * GIB) for name in "ab"]
     cluster = Cluster(
         *machines, rebalance=True, rebalance_after=20.0, cooldown=10.0, need=need, settle=5.0
@@ -40,7 +40,7 @@ def test_usage_measured_at_a_move_is_reserved_until_the_readings_show_the_proces
 
 @pytest.mark.parametrize(("code", "run_time"), [(1, 600.0), (0, 0.5)])
 def test_failed_and_short_runs_never_lower_the_learned_needs(code: int, run_time: float) -> None:
-    """They may not have got far; a larger peak counts all the same."""
+    """Such runs may have ended early; a larger peak of such a run still counts."""
     cluster = Cluster(Machine("a"))
 
     def run(name: str, memory: float, code: int, run_time: float) -> float:
@@ -58,7 +58,7 @@ def test_failed_and_short_runs_never_lower_the_learned_needs(code: int, run_time
 
 
 def test_readings_after_a_long_cut_are_as_far_ahead_as_the_time_explains() -> None:
-    """The slave has counted its cycles meanwhile; a forged sequence is still refused."""
+    """The slave has counted its cycles during the cut; a forged sequence is still refused."""
     cluster = Cluster("a", "b").with_processes(process("p"))
     machine = cluster.machines["a"]
     cluster.cut("a", seconds=5.0)

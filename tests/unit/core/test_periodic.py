@@ -147,7 +147,7 @@ def test_the_first_checkpoint_is_recorded_and_explained():
     ids=["long text", "long name", "many", "list"],
 )
 def test_an_event_has_the_durations_of_an_executor_within_bounds(seconds):
-    """With a megabyte in each of some events, no listing of events would reach its reader."""
+    """A few events with a megabyte each would make every listing of events too large to send."""
     host = Host()
     host.answer = {"size": 5000, "seconds": seconds}
     cluster = running(Pacing(), host)
@@ -213,7 +213,7 @@ def test_a_policy_without_a_valid_pace_makes_no_checkpoint(policy, reason):
 
 
 def test_a_pace_of_another_type_of_number_is_read_as_one():
-    """The core adds it to times, which not every type of number allows."""
+    """The core adds the pace to times, which not every type of number allows."""
     host = Host()
     cluster = running(pacing(Decimal(10)), host)
     cluster.wait(35.0)
@@ -252,7 +252,7 @@ def test_the_images_of_an_ended_instance_are_removed():
 
 
 def test_a_lost_order_to_remove_images_is_repeated():
-    """No answer to it arrives; the images would stay on the host for ever."""
+    """Without an answer the order is repeated; otherwise the images would stay on the host."""
     host = Host()
     cluster = running(Pacing(), host)
     cluster.wait(12.0)
@@ -268,7 +268,7 @@ def test_a_lost_order_to_remove_images_is_repeated():
 
 
 def test_dumps_that_always_fail_pause_the_process_less_and_less():
-    """Each of them freezes the process for a while."""
+    """Each dump freezes the process for a while, so the wait after each failure doubles."""
     host = Host()
     host.answer = RuntimeError("no room")
     cluster = running(Pacing(), host)

@@ -276,7 +276,7 @@ def test_a_plugin_fails_until_the_method_that_failed_succeeds() -> None:
 
 
 def test_any_success_ends_the_failure_of_a_call_that_is_not_known() -> None:
-    """A former process ended in it."""
+    """A former process ended in this call, so the method may be unknown."""
     calls, plugin = PluginCalls(), ("scoring", "x")
     calls.note(plugin, "", "the process has ended in a call of it")
     calls.changes(0.0)

@@ -214,7 +214,7 @@ def test_a_policy_changes_neither_the_spec_nor_the_labels_of_hosts():
 
 
 def test_a_choice_of_endless_hosts_costs_one_call():
-    """No alarm ends the loop in C that would make a tuple of them."""
+    """An alarm could not end the loop in C that would convert endless hosts to a tuple."""
     policy = Asked()
     cluster = running(policy, "a", "b")
     policy.answer = CheckpointChoice(repeat(others(cluster)[0]))  # type: ignore[arg-type]

@@ -39,7 +39,7 @@ def forget_order(cluster: Cluster) -> None:
 
 
 def test_a_restart_order_without_an_answer_is_repeated_until_the_run_has_changed() -> None:
-    """The process is restarted once."""
+    """The master repeats the order, and the process is restarted once."""
     cluster = Cluster("a").with_processes(process("p"))
     cluster.ask(happened.RestartRequested, ("p",), settle=False)
     lose_orders(cluster)
@@ -88,7 +88,7 @@ def test_a_restart_that_was_carried_out_is_not_repeated_by_the_next_master() -> 
 
 
 def test_a_run_that_its_policy_started_anew_is_not_restarted_by_an_older_order() -> None:
-    """The order was meant for the run that has crashed."""
+    """The order was meant for the crashed run, not for the one that the policy has started."""
     cluster = Cluster("a").with_processes(process("p", restart=RestartPolicy("always")))
     cluster.ask(happened.RestartRequested, ("p",), settle=False)
     cluster.machines["a"].ordered.clear()

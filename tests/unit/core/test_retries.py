@@ -1,4 +1,4 @@
-"""Retries: each has a memory of what failed and a back-off, which a change of the facts ends."""
+"""Retries: each remembers what failed and has a back-off, which a change of the facts ends."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_wait_after_each_failure_in_a_row_doubles_up_to_the_longest() -> Non
 
 
 def test_what_has_failed_waits_longer_than_everything_else() -> None:
-    """A change of it ends both waits."""
+    """A change of what has failed ends both waits."""
     retries = Retries()
     retries.note("b", "crashed", 0.0, 30.0)
     assert (retries.why_none(1.0), retries.waiting(1.0)) == ("crashed", {"b": "crashed"})
@@ -106,7 +106,7 @@ def test_a_drain_tries_another_host_after_a_failed_one() -> None:
 
 
 def test_an_eviction_does_not_repeat_a_failing_destination_at_each_cool_down() -> None:
-    """The waits double."""
+    """The wait before the same destination doubles with each failure."""
     cluster = broken_beside(overlap=False)
     cluster.machines["a"].busy["memory"] = 0.85
     cluster.machines["a"].shown["p"] = {"memory": 2.0**30}
@@ -126,7 +126,7 @@ def test_a_new_run_of_the_slave_forgets_failed_moves_to_its_host() -> None:
 
 
 def test_a_user_may_repeat_a_failed_move_at_once() -> None:
-    """A request has no back-off."""
+    """Requests of users have no back-off."""
     cluster = broken_beside()
     assert cluster.migrate("p").accepted
     play(cluster, 1.0)
@@ -163,7 +163,7 @@ def test_a_running_process_moves_to_a_host_that_has_refused_it_long_ago() -> Non
 
 
 def test_a_host_that_refuses_a_process_for_ever_is_tried_less_and_less() -> None:
-    """So does one that a former master has excluded."""
+    """The wait doubles, also for a host that a former master has excluded."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.79, "cpu": 0.1}))
     cluster.machines["a"].refuses["p"] = "no such program"
     cluster.submit(process("p", memory=500))
@@ -209,7 +209,7 @@ def test_an_order_of_which_nothing_is_reported_ends_without_an_answer() -> None:
 
 
 def test_a_refused_change_of_a_running_process_is_repeated_with_back_off() -> None:
-    """Its slave cannot set the limit."""
+    """The slave refuses the change, because it cannot set the limit."""
     cluster = Cluster(Machine("a", uses=1e9))
     cluster.apply("nav", process("p", limits=Limits(memory=2e9)))
     cluster.apply("nav", process("p", limits=Limits(memory=5e8)))

@@ -1,4 +1,4 @@
-"""What runs is tied to the spec with which it was started, whatever its application has since."""
+"""A running instance keeps the spec of its start, whichever spec its application has since."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def desired(cluster: Cluster) -> ProcessSpec:
 
 @pytest.mark.parametrize("restarted", [False, True])
 def test_a_former_version_that_returns_with_its_host_is_replaced(restarted: bool) -> None:
-    """The master re-adopts the former version as such, and the new version follows."""
+    """The master re-adopts the instance as the former version, and then replaces it."""
     cluster = lost()
     cluster.apply("nav", new(cluster["p"].spec))
     cluster.wait(5.0)
@@ -56,7 +56,7 @@ def test_a_former_version_that_returns_with_its_host_is_replaced(restarted: bool
 
 
 def test_a_job_that_completed_on_a_lost_host_does_not_complete_its_new_version() -> None:
-    """The work of the new program has not been done."""
+    """The program of the new version has not run, so the job runs again."""
     cluster = lost(job)
     cluster.apply("nav", new(cluster["p"].spec))
     cluster.machines["a"].finish("p", cluster.now, code=0, run_time=10.0)
@@ -66,7 +66,7 @@ def test_a_job_that_completed_on_a_lost_host_does_not_complete_its_new_version()
 
 
 def test_a_process_that_has_its_version_again_is_re_adopted() -> None:
-    """The return to the version that still runs there interrupts nothing."""
+    """The instance runs the version that is desired again, so it is not interrupted."""
     cluster = lost()
     cluster.apply("nav", new(cluster["p"].spec))
     cluster.wait(1.0)
@@ -77,7 +77,7 @@ def test_a_process_that_has_its_version_again_is_re_adopted() -> None:
 
 
 def test_a_change_in_place_during_the_loss_is_kept() -> None:
-    """The re-adopted instance has it, with the former program."""
+    """The re-adopted instance has the former program, and the change in place."""
     cluster = lost()
     cluster.apply("nav", replace(new(cluster["p"].spec), priority=7))
     cluster.rejoin("a", seconds=0.1)
@@ -87,7 +87,7 @@ def test_a_change_in_place_during_the_loss_is_kept() -> None:
 
 
 def test_a_run_that_was_given_up_is_not_the_next_run() -> None:
-    """A process that ended meanwhile and is started again has no instance to re-adopt."""
+    """A process that ended during the loss and is started again has no instance to re-adopt."""
     cluster = lost()
     state, former = cluster.state, cluster["p"]
     state.unqueue(former)
@@ -108,7 +108,7 @@ def reserved(cluster: Cluster, host: str = "a") -> float:
 
 @pytest.mark.parametrize(("before", "after"), [(1, 6), (6, 1)])
 def test_changed_needs_change_the_reservation(before: int, after: int) -> None:
-    """The running process keeps what its spec in force declares, not what its start did."""
+    """The reservation of a running process follows its spec in force, not that of its start."""
     cluster = Cluster(Machine("a", memory=10 * GIB, busy=IDLE))
     cluster.apply("nav", process("p", before * 1024))
     cluster.wait(3.0)
@@ -134,7 +134,7 @@ def test_changed_needs_change_the_reservation_of_a_standby() -> None:
 
 
 def test_the_needs_of_a_new_version_are_reserved_after_a_restart_of_the_master() -> None:
-    """The destination of a replacement has the needs of the version that it runs."""
+    """The destination of a replacement reserves the needs of the version that it runs."""
     cluster = Cluster(Machine("a", memory=10 * GIB, busy=IDLE))
     spec = node("p", memory=1024, migration=MigrationPolicy("relaunch"))
     cluster.apply("nav", spec)
@@ -152,7 +152,7 @@ def test_the_needs_of_a_new_version_are_reserved_after_a_restart_of_the_master()
 
 
 def test_the_peak_of_a_former_version_is_learned_of_its_own_program() -> None:
-    """After the commit its process has another program already."""
+    """After the commit the process has another program, but the peak was of the former one."""
     cluster = Cluster("a")
     cluster.apply("nav", movable("p"))
     cluster.wait(2.0)
@@ -208,7 +208,7 @@ def moving() -> tuple[Cluster, ProcessSpec]:
 
 
 def test_a_return_undoes_a_replacement_that_is_under_way() -> None:
-    """The former version still runs, so nothing of it is interrupted."""
+    """The former version still runs, and is not interrupted."""
     cluster, _ = moving()
     cluster.finish("q", code=1)
     cluster.wait(3.0)
@@ -230,7 +230,7 @@ def test_a_third_version_waits_for_the_second_and_replaces_it() -> None:
 
 
 def test_the_version_that_is_being_started_needs_no_action() -> None:
-    """A plan compares with what follows from the work under way."""
+    """A plan compares with the state to which the work under way leads."""
     cluster, spec = moving()
     reply = cluster.apply("nav", new(spec), process("q"), process("r"))
     assert actions(reply) == {"r": "start"}
@@ -254,7 +254,7 @@ def test_a_process_that_is_being_stopped_for_a_version_starts_with_the_newest() 
 
 
 def test_a_version_that_fails_during_a_return_leads_to_the_version_that_returns() -> None:
-    """The version before was the last one that was reached."""
+    """The version that returns was the last one that was reached."""
     cluster, spec = moving()
     cluster.machines["a"].stubborn.add("p")  # so the replacement is undone later
     cluster.finish("q", code=1)

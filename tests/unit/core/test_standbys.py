@@ -342,7 +342,7 @@ def test_an_ended_process_is_not_pruned_before_its_standby_is_given_up() -> None
 
 
 def test_an_instance_that_is_being_stopped_is_not_readopted_after_another_loss() -> None:
-    """The instance returned with its host while its standby, which was not ready, had to end."""
+    """The host returned while the standby, which was not ready, had to end, and is lost again."""
     cluster = with_standby(quirk="unfit", host_loss=HostLossPolicy("elsewhere"))
     for machine in cluster.machines.values():
         machine.stubborn.add("p")

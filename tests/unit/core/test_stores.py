@@ -31,7 +31,7 @@ def submit(cluster: Cluster, by: Requester, *specs: ProcessSpec) -> Reply:
 
 
 def test_large_specs_of_one_user_are_bounded_together() -> None:
-    """The next one is refused; another user, and an operator, may still submit."""
+    """A further large spec is refused; another user, and an operator, may still submit."""
     cluster = Cluster("a")
     accepted = [submit(cluster, MALLORY, large(f"m{n}")).accepted for n in range(300)]
     assert sum(accepted) == 9
@@ -74,7 +74,7 @@ def test_versions_of_applications_are_bounded_by_owner() -> None:
 
 
 def test_a_plan_forgets_nothing() -> None:
-    """Only what is carried out takes the place of ended processes."""
+    """Only a request that is carried out removes ended processes."""
     cluster = Cluster("a")
     for number in range(8):
         assert submit(cluster, MALLORY, large(f"m{number}")).accepted

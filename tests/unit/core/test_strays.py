@@ -24,7 +24,7 @@ def ghost(name: str, number: int, state: InstanceState = InstanceState.RUNNING) 
 
 
 def report(cluster: Cluster, host: str, *statuses: InstanceStatus) -> None:
-    """Send a status batch of a host, as its key allows, beside those of its slave."""
+    """Send a status batch of a host, as its key allows, in addition to those of its slave."""
     machine = cluster.machines[host]
     machine.batches += 1
     cluster.tell(
@@ -62,7 +62,7 @@ def test_a_ghost_gives_its_host_no_right_on_the_process() -> None:
 
 
 def test_a_ghost_refuses_no_submission_of_its_name() -> None:
-    """The process is queued, waits for the end of the ghost for a bounded time, and starts."""
+    """The process is queued, waits for the end of the stray for a bounded time, and starts."""
     cluster = Cluster("a", "b")
     cluster.set_host("a", "cordon")
     haunt(cluster, "a", "p", 500)
@@ -89,7 +89,7 @@ def test_further_ghosts_do_not_prolong_the_wait() -> None:
 
 
 def test_a_ghost_ends_no_run_and_teaches_nothing() -> None:
-    """Its end changes neither phase, exit code nor learned needs of the process."""
+    """The end of a stray changes neither phase, exit code nor learned needs of the process."""
     cluster = Cluster("a", "b").with_processes(job("p"))
     before = dict(cluster.intents["learned"])
     cluster.wait(1.0)
@@ -101,7 +101,7 @@ def test_a_ghost_ends_no_run_and_teaches_nothing() -> None:
 
 
 def test_a_ghost_moves_no_neighbour() -> None:
-    """A host with a ghost of one process may run another that must be apart from it."""
+    """A host that reports a stray of one process may run another that must be apart from it."""
     cluster = Cluster("a")
     report(cluster, "a", ghost("p", 500))
     rule = NeighbourRule("apart", ("p",))
@@ -110,7 +110,7 @@ def test_a_ghost_moves_no_neighbour() -> None:
 
 
 def test_a_host_fills_the_master_with_a_bounded_number_of_ghosts() -> None:
-    """All of them are ordered to stop; the master tracks the first ones."""
+    """The master orders the stop of all strays, and tracks only the first ones."""
     cluster = Cluster("a", "b").with_processes(process("p"))
     for batch in range(12):
         report(cluster, "a", *(ghost(f"g{batch}", 10_000 + n + 1000 * batch) for n in range(1000)))
@@ -121,7 +121,7 @@ def test_a_host_fills_the_master_with_a_bounded_number_of_ghosts() -> None:
 
 @pytest.mark.parametrize("removed", [False, True])
 def test_a_process_that_is_removed_leaves_no_stray_behind(*, removed: bool) -> None:
-    """A ghost that has ended is forgotten, whether or not its process still exists."""
+    """The master removes a stray that has ended, whether or not its process still exists."""
     cluster = Cluster("a").with_processes(job("p", host_loss=HostLossPolicy()))
     report(cluster, "a", ghost("p", 500))
     cluster.cancel("p")
@@ -133,7 +133,7 @@ def test_a_process_that_is_removed_leaves_no_stray_behind(*, removed: bool) -> N
 
 
 def test_a_pruned_host_gives_up_its_ghosts() -> None:
-    """What a lost host has reported does not outlast the host."""
+    """The strays of a lost host are removed together with the host."""
     cluster = Cluster("a", Machine("b"), lease=2.0)
     report(cluster, "b", ghost("p", 500))
     cluster.cut("b", seconds=10.0)

@@ -129,7 +129,7 @@ YEARS = 56 * 365.25 * 86400.0
 @pytest.mark.parametrize("seconds", [YEARS, -YEARS])
 @pytest.mark.parametrize("fault", [Cluster.restart_master, lose_and_return])
 def test_a_clock_that_is_set_changes_no_time_limit(fault, seconds) -> None:
-    """The host reports for how long the job has run; unix time says nothing about that."""
+    """The host reports for how long the job has run, so the unix time does not matter."""
     cluster = Cluster("a", lease=1.0, suspect=0.5)
     cluster.submit(job("p", time_limit=20.0, host_loss=HostLossPolicy("elsewhere", 0.0)))
     cluster.wait(2.0)

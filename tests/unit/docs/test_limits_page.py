@@ -19,7 +19,7 @@ def shown(amount: Amount) -> str:
 
 
 def test_the_table_has_every_store() -> None:
-    """Names and bounds by role are those of the ledger."""
+    """The table has the names and bounds by role of the ledger."""
     rows = re.findall(r"^\| ([a-z ]+) \| (\d.*?) \| (\d.*?) \|", PAGE.read_text(), re.MULTILINE)
     expected = [(store.value, shown(user), shown(root)) for store, (user, root) in BOUNDS.items()]
     assert [row for row in rows if "entries" in row[1]] == expected

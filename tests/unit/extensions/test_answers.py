@@ -110,7 +110,7 @@ def test_a_copy_has_no_methods_of_the_plugin(answer: Any, hint: Any, kinds: set[
 
 
 def test_a_copy_has_the_value_of_the_base_type() -> None:
-    """The methods of the plugin do not take part in the copy either."""
+    """The copy does not call methods of the plugin either."""
     assert whole(OddFraction(0.5), float) == 0.5
     assert exact(OddNumber(3)) == 3
     assert whole(OddCapabilities(), Capabilities).launcher == "ours"
@@ -146,7 +146,7 @@ def test_an_offer_stays_as_it_was_registered() -> None:
 
 
 def test_the_variables_of_a_launcher_are_those_of_its_registration() -> None:
-    """Each start of a process reads them."""
+    """The variables are copied at registration, because each start of a process reads them."""
     offer = LauncherOffer("ours", lambda _: SimpleNamespace(prepare=None), variables=("X",))
     object.__setattr__(offer, "variables", Variables())
     registry = _registry(offer, "register_launchers")
@@ -177,7 +177,7 @@ class OddProbe:
 
 
 def test_resources_and_labels_of_a_probe_have_no_methods_of_the_plugin(tmp_path: Any) -> None:
-    """The slave sends both with each registration."""
+    """Resources and labels are copies, because the slave sends both with each registration."""
     registry = _registry(ProbeOffer("x", lambda *_: OddProbe()), "register_probes")
     context = ProbeContext("machine", {}, tmp_path, None)  # type: ignore[arg-type]
     (made,) = registry.probes({"x": {}}, context).made
@@ -206,7 +206,7 @@ def test_usage_is_taken_of_the_announced_resources_alone() -> None:
 
 
 def test_devices_have_no_methods_of_the_plugin() -> None:
-    """Their texts are in the registration, and in listings."""
+    """The texts of devices are copies, because registrations and listings have them."""
     found = Device("gpu", OddText("a"), about=OddText("fast"))
     (device,) = read_devices(SimpleNamespace(devices=lambda: [found]))
     assert (type(device.unit), type(device.about)) == (str, str)

@@ -1,4 +1,4 @@
-"""Nothing calls a plugin beside the guard: each access to a member of a contract is found."""
+"""No code calls a plugin without the guard: each access to a member of a contract is found."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_each_call_of_a_plugin_is_guarded() -> None:
 
 
 def test_only_a_guarded_sink_leaves_the_registry() -> None:
-    """So the calls of sinks need no finder: mypy knows that each is a `GuardedSink`."""
+    """Calls of sinks need no search: mypy knows that each sink is a `GuardedSink`."""
     assert inspect.get_annotations(Registry.sink)["return"] == "GuardedSink"
     naming = {
         str(path.relative_to(ROOT.parent))

@@ -1,4 +1,4 @@
-"""The one way into the code of plugins: whatever a plugin does costs one call."""
+"""The guard of calls of plugins: a plugin that misbehaves makes only that call fail."""
 
 from __future__ import annotations
 
@@ -296,7 +296,7 @@ def test_what_a_plugin_changes_in_the_process_is_restored(
 
 @pytest.mark.parametrize("harm", HARM)
 def test_what_a_plugin_changes_in_a_decision_is_restored_within_a_second(harm: str) -> None:
-    """What costs system calls is restored by the loop of the part, once a second."""
+    """The loop restores once a second the state whose restoration costs system calls."""
     before, state = _state(), ProcessState()
     _by_deadline(HARM[harm])
     state.restore()

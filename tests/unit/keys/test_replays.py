@@ -1,4 +1,4 @@
-"""Recorded messages and copied processes: what the sealing of each message cannot refuse.
+"""Recorded messages and copied processes, which the seal of a message does not detect.
 
 A connection with keys of its own for each session refuses all of this.
 """

@@ -50,7 +50,7 @@ def test_the_time_of_slow_plugins_does_not_count_for_the_core(monkeypatch, takes
 
 @pytest.mark.parametrize(("slept", "passed"), [(600.0, 1.0), (0.05, 601.0)])
 def test_a_suspend_of_the_machine_makes_no_host_silent(monkeypatch, slept, passed) -> None:
-    """The master heard nothing while it slept, and must not give up all hosts at its resume."""
+    """The master received nothing in the suspend, and must not give up all hosts afterwards."""
     master = MasterRuntime.__new__(MasterRuntime)
     monkeypatch.setattr("rosrm.clocks.suspended_time", lambda: 30.0)
     master._behind, master._held, master._suspends = 0.0, None, clocks.Suspends()

@@ -94,7 +94,7 @@ REQUEST = {"environment": {}, "plugin": "m:Node", "arguments": []}
 
 
 def test_a_component_that_exits_in_its_constructor_ends_no_other(tmp_path):
-    """`sys.exit` in it is its fault, as any other exception is."""
+    """`sys.exit` in a constructor is a fault of this component, like any other exception."""
     errors: list[str] = []
     with container(str(tmp_path), lambda *_: sys.exit("no map"), errors):
         for _ in range(2):

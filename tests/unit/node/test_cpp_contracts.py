@@ -1,4 +1,4 @@
-"""What `rosrm_node_cpp` gives to rclcpp, on a double that refuses what rclcpp refuses.
+"""Arguments that `rosrm_node_cpp` passes to rclcpp, on a double that refuses the same ones.
 
 tests/cpp/stubs/README.md lists the calls and the contract of each.
 """
@@ -43,7 +43,7 @@ def contracts(tmp_path_factory):
 
 @pytest.mark.parametrize("case", CASES)
 def test_no_call_breaks_a_contract_of_rclcpp(contracts, tmp_path, case):
-    """What compiles may still raise at run time, as an empty list of parameters does."""
+    """A call that compiles may still raise at run time, such as an empty list of parameters."""
     done = subprocess.run(
         [sys.executable, "-c", RUN, contracts, case, tmp_path],
         cwd=ROOT, env=os.environ, capture_output=True, text=True, timeout=120, check=False,

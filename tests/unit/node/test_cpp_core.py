@@ -91,7 +91,7 @@ def test_messages_are_read_and_written_as_by_ros(core, case):
 
 @given(mark=MESSAGES[2], version=st.integers(5, 7))
 def test_marks_of_earlier_releases_are_read(core, mark, version):
-    """Snapshots have them, and are restored after an update, in Python and in C++."""
+    """Snapshots with marks of earlier releases are restored after an update, also in C++."""
     mark.protocol_version = version
     data = old_mark(mark)
     found, again = decoded_mark(data), rewritten(core, 2, data)

@@ -1,4 +1,4 @@
-"""Notes of the calls of plugins: whom a process called when it ended."""
+"""Notes of the calls of plugins: which plugin a process called when it ended."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_a_plugin_that_ends_its_process_is_named_and_then_left_out(
 
 
 def test_a_plugin_of_another_version_is_tried_again(tmp_path: Path) -> None:
-    """A new version of its distribution may have mended the fault."""
+    """A new version of its distribution may have fixed the fault."""
     for _ in range(2):
         _run(tmp_path, "exit")
     notes = CrashNotes(tmp_path)
@@ -81,7 +81,7 @@ def test_a_plugin_of_another_version_is_tried_again(tmp_path: Path) -> None:
 
 
 def test_a_kill_from_outside_is_no_proof(tmp_path: Path) -> None:
-    """Two kills of a part leave no plugin out that it happened to call; the next start names it."""
+    """After two kills the plugin that was running is named, but it is still called."""
     for _ in range(2):
         _kill(tmp_path)
     notes = CrashNotes(tmp_path)
@@ -91,7 +91,7 @@ def test_a_kill_from_outside_is_no_proof(tmp_path: Path) -> None:
 
 
 def test_an_orderly_end_leaves_no_file(tmp_path: Path) -> None:
-    """A part that ends in order leaves nothing, and its next start blames nobody."""
+    """A part that ends in order leaves no file, and its next start names no plugin."""
     assert _run(tmp_path, "none") == ""
     assert list(tmp_path.glob("plugin-*")) == []
     with kept_notes(tmp_path) as crashes:

@@ -1,4 +1,4 @@
-"""The last lines of a log, whatever the log is."""
+"""The last lines of a log of any content or length, or of a missing log."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_only_the_end_of_a_long_log_is_read(tmp_path):
 
 
 def test_a_log_that_cannot_be_read_has_its_reason_as_its_line(tmp_path):
-    """The error that shows the lines stays; the log is missing, or a directory."""
+    """If the log is missing or a directory, the reason takes the place of the lines."""
     assert last_lines(tmp_path / "none") == [
         "(the log cannot be read: No such file or directory)"
     ]  # fmt: skip

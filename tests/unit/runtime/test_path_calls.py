@@ -1,4 +1,4 @@
-"""Calls on paths of users in threads: a late one holds up neither the loop nor the others."""
+"""Calls on paths of users in threads: a late call delays neither the loop nor other calls."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_a_dead_mount_holds_up_one_thread(loop, monkeypatch):
 
 
 def test_the_number_of_late_calls_is_bounded(loop, monkeypatch):
-    """One call more is refused at once, with some of the paths."""
+    """A call beyond the bound is refused at once; the reason names some of the paths."""
     monkeypatch.setattr(path_calls, "MOST_LATE", 2)
     for number in range(2):
         loop.run(f"/{number}", waits=True)
@@ -108,13 +108,13 @@ def test_the_number_of_late_calls_is_bounded(loop, monkeypatch):
 
 
 def test_mounts_of_other_machines_are_told_by_their_type(tmp_path):
-    """Local file systems answer each path for itself."""
+    """A late path on a local file system blocks no other path there, unlike on a remote mount."""
     assert path_calls._remote_mount(str(tmp_path)) == ""
     assert path_calls._remote_mount("/proc/self") == ""
 
 
 def test_the_newest_value_is_written_when_a_late_path_answers(loop):
-    """No later value has to follow; a value in between is left out."""
+    """The newest value is written although no later one follows; older ones are skipped."""
     written: list[str] = []
 
     def write(value: str) -> None:

@@ -12,7 +12,7 @@ from rosrm.runtime.signalling import send, send_by, send_to_group
 
 
 def test_an_ended_process_is_no_refusal():
-    """The sender wanted the end, which has come: pid, group and descriptor report nothing."""
+    """Signals to an ended process by pid, group or descriptor return no reason."""
     process = subprocess.Popen(["sleep", "60"], start_new_session=True)
     descriptor = os.pidfd_open(process.pid)
     assert send_by(descriptor, signal.SIGKILL) == ""

@@ -41,7 +41,7 @@ def child(request: pytest.FixtureRequest, tmp_path: Path):
 
 
 def test_a_child_that_a_plugin_has_left_does_not_hold_the_lock(child, tmp_path: Path) -> None:
-    """The next part starts; a fork by C, which Python cannot see, is named as it is."""
+    """The next part starts; a child forked in C, unseen by Python, is named in the error."""
     how, pid = child
     if how == "python":
         with only_one(tmp_path / "state", "slave", code="c", remedy=""):

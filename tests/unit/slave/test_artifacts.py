@@ -219,7 +219,7 @@ def test_an_error_of_the_disk_says_what_it_has_prevented(host, offered, monkeypa
 
 
 def test_a_fetch_that_stalls_says_what_it_waits_for(host, offered, monkeypatch):
-    """The progress alone would show the same bytes for a minute."""
+    """The reason names the awaited answer, because the progress alone would not change."""
     monkeypatch.setattr(fetch, "_ANSWER", 0.1)
     host.master.is_silent = True
     host.prepare(1, offered("model"))
@@ -265,7 +265,7 @@ def test_a_stopped_instance_cancels_its_fetch(host, offered, tmp_path):
 
 
 def test_a_stopped_instance_lets_others_fetch(host, offered):
-    """Its fetches took all places, so that the other one had to wait."""
+    """The fetches of the stopped instance had occupied all places."""
     host.master.is_silent = True
     stopped = host.prepare(1, offered("one"), offered("two"))
     host.run_until(lambda: len(host.master.asked) >= 2, "both are fetched")

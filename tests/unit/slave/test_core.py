@@ -323,7 +323,7 @@ def test_an_instance_of_a_former_run_of_the_slave_is_ready(one) -> None:
 
 
 def test_facts_that_a_killed_supervisor_has_not_stored_are_stored_again(node) -> None:
-    """A later run of the slave would wait for the node again."""
+    """Otherwise a later run of the slave would wait for the node again."""
     (remember,) = [
         one for one in node.step(SeenInGraph(NODE_1)) if isinstance(one, slave_commands.Remember)
     ]
@@ -439,7 +439,7 @@ def test_an_amendment_of_a_held_instance(running) -> None:
 
 
 def test_an_amendment_is_kept_for_a_start_that_still_waits_for_files(running) -> None:
-    """The runtime starts the instance with it; a later one without limits keeps the limits."""
+    """The instance starts with the amendment; a later one without limits keeps the limits."""
     limited = replace(ON_FAILURE, limits=Limits(memory=2e9))
     running.step(AmendmentOrdered(ONE, limited))
     running.step(AmendmentOrdered(ONE, NEVER))

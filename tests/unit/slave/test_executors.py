@@ -197,7 +197,7 @@ def test_an_unknown_executor_is_refused_with_those_that_there_are() -> None:
 
 
 def test_an_executor_that_never_returns_costs_few_threads() -> None:
-    """A check of the host is repeated for ever, and each call that hangs keeps its thread."""
+    """Repeated checks of a host that hang keep only a bounded number of threads."""
     released = threading.Event()
     rig = Rig(lambda _: released.wait() and {})
     before = threading.active_count()

@@ -124,7 +124,7 @@ def test_the_rate_of_a_simulated_node_counts_by_its_clock(factor) -> None:
 
 
 def test_a_paused_simulator_fails_no_node() -> None:
-    """No simulated time passes, so no message is due; the checks go on with the simulator."""
+    """No simulated time passes, so no message is due; the checks continue with the simulator."""
     node = SimulatedNode()
     assert node.simulates(20.0, 6.0, 1.0) == ""
     assert node.simulates(3600.0, 6.0, 0.0) == ""
@@ -133,7 +133,7 @@ def test_a_paused_simulator_fails_no_node() -> None:
 
 
 def test_a_simulator_that_is_started_again_fails_no_node() -> None:
-    """Its time begins at zero once more."""
+    """The time of a restarted simulator begins at zero again."""
     node = SimulatedNode()
     assert node.simulates(20.0, 6.0, 1.0) == ""
     node.clock = 0.0

@@ -9,7 +9,7 @@ from tests.faults.disks import small_disk
 
 
 def test_a_full_and_a_read_only_disk_are_faults(tmp_path):
-    """Nothing is left of the bytes that were tried."""
+    """The watch reports both faults, and leaves no file behind."""
     with small_disk(tmp_path / "disk") as disk:
         assert fault_of(disk.place) == ""
         assert not any(disk.place.iterdir())
@@ -22,5 +22,5 @@ def test_a_full_and_a_read_only_disk_are_faults(tmp_path):
 
 
 def test_a_directory_that_is_gone_is_no_fault_of_its_disk(tmp_path):
-    """Its users report that themselves."""
+    """The parts that use a missing directory report that, so the watch of the disk does not."""
     assert fault_of(tmp_path / "gone") == ""

@@ -52,7 +52,7 @@ def starter(*waiting: InstanceId) -> tuple[Starter, list[events.Event]]:
 
 @pytest.mark.parametrize("command", FOLLOW, ids=lambda one: type(one).__name__)
 def test_each_command_to_an_instance_that_waits_is_decided(command) -> None:
-    """None reaches the supervisor, which would refuse an instance that it does not know."""
+    """No command reaches the supervisor, which would refuse an instance that it does not know."""
     made, taken = starter(ONE)
     acts = FOLLOW[command] is not None
     assert made.call_off(command) is acts
@@ -61,7 +61,7 @@ def test_each_command_to_an_instance_that_waits_is_decided(command) -> None:
 
 @pytest.mark.parametrize("command", FOLLOW, ids=lambda one: type(one).__name__)
 def test_each_command_to_a_started_instance_is_the_supervisors(command) -> None:
-    """The starter does nothing."""
+    """The starter leaves commands to started instances to the supervisor."""
     made, taken = starter()
     assert not made.call_off(command)
     assert taken == []

@@ -50,7 +50,7 @@ def test_a_later_deadline_replaces_an_earlier_one(timer, none) -> None:
     timer.clear()
     timer.set(none)
     assert not fires(timer)
-    timer.clear()  # wakes nobody, and does not wait
+    timer.clear()  # has no effect, and does not wait
 
 
 def test_a_machine_without_such_timers_is_no_fault(monkeypatch, capfd) -> None:

@@ -220,7 +220,7 @@ def test_the_first_step_after_a_suspend_ends_a_fenced_instance():
 
 
 def test_a_slave_that_sleeps_too_renews_no_fence():
-    """After the resume it knows only the contact before, so its first word postpones nothing."""
+    """The first report of a slave after a resume has the contact before it, and renews no fence."""
     core, instance = running(heard=0.0)
     core.handle(events.ContactReported(2.0, 602.0), 602.0)
     core.handle(events.TimePassed(), 602.0)

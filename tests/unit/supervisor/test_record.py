@@ -303,7 +303,7 @@ def test_lines_that_wait_for_a_disk_are_bounded(tmp_path, core, stuck, monkeypat
 
 @pytest.mark.parametrize("fault", [MemoryError(), OSError()])
 def test_no_fault_of_a_write_loses_a_line(tmp_path, core, record, monkeypatch, fault):
-    """A fault may have no text and no number; the lines are written once it is over."""
+    """After a fault without a text or number is over, all lines are written."""
     record.state(core.instances[TALKER], 77)
 
     def fails(*_):

@@ -824,7 +824,7 @@ def test_a_suspend_prolongs_no_fence():
 
 
 def test_a_suspend_delays_no_restart():
-    """A back-off gives way to others; nothing has to be done by the process in that time."""
+    """A back-off counts the suspend, because the process has nothing to do in that time."""
     core, _ = started(restart=RestartRule("always"))
     core.handle(Exited(TALKER, 1), 0.0)
     due = core.deadline()

@@ -44,7 +44,7 @@ def test_the_outbox_of_alerts_is_private(tmp_path):
 
 
 def test_an_outbox_that_is_a_fifo_is_refused(tmp_path):
-    """Opening it would wait for ever."""
+    """An outbox that is a FIFO is refused, because opening it would block for ever."""
     os.mkfifo(tmp_path / "outbox")
     with pytest.raises(OutboxError, match="no regular file"):
         Outbox(tmp_path / "outbox")
@@ -59,7 +59,7 @@ def test_a_report_is_private(tmp_path):
 
 
 def test_a_key_is_written_beside_no_fifo(tmp_path):
-    """Another user of the directory may have made one of the temporary name."""
+    """A FIFO of another user under the temporary name does not get the key."""
     os.mkfifo(tmp_path / "robot.key.new")
     key = PrincipalKey(Grant(principal_of("host:robot"), Role.HOST, 1), bytes(32), bytes(32))
     with pytest.raises(Exception, match="no regular file"):

@@ -136,7 +136,7 @@ def test_a_message_of_one_of_several_publishers_that_did_not_come_is_missed(make
 
 
 def test_a_publisher_that_was_restarted_has_lost_nothing(make):
-    """Its numbers begin at 1 again."""
+    """The numbers of a restarted publisher begin at 1 again, which is no loss."""
     buffer = make(10, ROOM, 0.0)
     for stamp, number in ((10, 7), (20, 8), (30, 1)):
         buffer.add(B, Sent(stamp, number), None, 0.0)
@@ -144,7 +144,7 @@ def test_a_publisher_that_was_restarted_has_lost_nothing(make):
 
 
 def test_the_numbers_that_several_threads_have_taken_show_no_loss(make):
-    """They arrive in any order."""
+    """Messages that several threads take arrive in any order, so a gap is no loss."""
     buffer = make(10, ROOM, 0.0)
     buffer.mix(A)
     for stamp, number in ((10, 1), (30, 3), (20, 2)):
@@ -166,7 +166,7 @@ def test_a_full_reader_may_have_dropped_a_message_of_one_of_several_publishers(m
 
 
 def test_a_reader_that_was_full_during_the_switch_fails_it(make):
-    """The source does not process any more what is missing here."""
+    """The silent source no longer processes a message that the destination has lost."""
     buffer = filled(make, (A, 1))
     cover(buffer, A, [1], single=False, now=0.0)
     buffer.is_last = True

@@ -57,7 +57,7 @@ def test_a_costly_reading_takes_a_small_share_of_a_core(costly, cost) -> None:
 
 
 def test_one_slow_reading_changes_no_pace(costly) -> None:
-    """Otherwise a garbage collection would hide the load of a second."""
+    """Otherwise one garbage collection would prevent readings for a second."""
     costly.for_seconds(1.0)
     costly.cost = 0.5
     assert costly.for_seconds(0.1) == 1

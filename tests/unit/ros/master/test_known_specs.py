@@ -55,7 +55,7 @@ def test_few_specs_are_kept_the_last_used_ones(monkeypatch) -> None:
 
 
 def test_large_specs_of_a_user_take_no_place_of_others() -> None:
-    """What is kept for each user is bounded in bytes."""
+    """The known specs of each user are bounded in bytes."""
     known, digests = KnownSpecs(), [f"{number:064}" for number in range(50)]
     bob = Requester("user:bob")
     known.keep(bob, digests[:1], SPECS)

@@ -9,7 +9,7 @@ from rosrm_lab import lab
 
 
 def test_the_reason_why_a_lab_was_not_made_stays_known():
-    """Its remains cannot be removed either; the user must read both reasons."""
+    """If the remains of the lab cannot be removed either, the error has both reasons."""
 
     def remove() -> None:
         raise LabError("host a of lab x did not end within 10 s")

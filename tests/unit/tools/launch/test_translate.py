@@ -93,7 +93,7 @@ def test_parameters_of_a_full_name_override_those_of_a_pattern():
 
 
 def test_a_variable_with_a_dollar_sign_stays_as_it_is():
-    """No shell reads it under launch either."""
+    """A `$` is kept, because launch does not pass variables through a shell either."""
     (entry,) = made(node(0, "a", environment={"A": "$B", "C": "d"}, prefix=["nice"])).work[
         "processes"
     ]

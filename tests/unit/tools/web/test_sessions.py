@@ -27,7 +27,7 @@ BOB = User("bob", "viewer", sha256(b"v" * 24).digest())
 
 
 def test_a_session_ends_with_the_token_of_its_user():
-    """Another role of the same token is that of the session, too."""
+    """The session has the newest role of its token, and ends with the token."""
     access = Access((ADA, BOB))
     sessions = Sessions(access)
     ada, bob = sessions.begin(ADA), sessions.begin(BOB)
@@ -38,7 +38,7 @@ def test_a_session_ends_with_the_token_of_its_user():
 
 
 def test_another_gateway_knows_no_session_of_this_one():
-    """The next run does not, either; a token is no id of a session."""
+    """Neither another gateway nor the next run accepts the id; a token is no id either."""
     access = Access((ADA,))
     number = Sessions(access).begin(ADA)
     assert Sessions(access).user_of(number) is None
@@ -131,19 +131,19 @@ def test_with_https_the_cookie_is_bound_to_the_host(tmp_path):
 
 @pytest.mark.parametrize("body", [b"a=1&" * 2**20, b"x" * (LARGEST_LOGIN + 1)])
 def test_a_large_login_is_refused_before_it_is_read(body):
-    """Whoever has no token may send a few kB."""
+    """A client without a token may send only a few kB."""
     status, _, _ = login(Settings(users=(ADA,)), body)
     assert status == 413
 
 
 def test_a_login_with_many_fields_is_a_wrong_token():
-    """The number of fields is bounded, too."""
+    """A form with more fields than the bound counts as a wrong token."""
     status, _, _ = login(Settings(users=(ADA,)), b"a=1&" * 1000)
     assert status == 401
 
 
 def test_one_user_leaves_room_for_the_requests_and_pages_of_others():
-    """Where tokens are required, the bound is for each user."""
+    """The bound is for each user where tokens are required."""
     access = Access((ADA, BOB))
     closing = [access.open(ADA, lambda: None) for _ in range(MOST_OPEN)]
     with pytest.raises(Busy, match="ada has"):
@@ -174,7 +174,7 @@ def test_a_flood_of_connections_fills_no_log(caplog):
 
 
 def test_other_errors_are_logged_as_ever(caplog):
-    """Only those of accepting are shortened."""
+    """Only repeated errors of accepting connections are shortened."""
     loop = asyncio.new_event_loop()
     serving.AcceptErrors()(loop, {"message": "m", "exception": ValueError("x")})
     loop.close()

@@ -151,7 +151,7 @@ class Choked(Master):
         self.left = 2
 
     def list(self, **options):
-        """Fail twice as a library does."""
+        """Raise twice an error that is no error of rosrm."""
         self.left -= 1
         if self.left >= 0:
             raise OSError(24, "Too many open files")
