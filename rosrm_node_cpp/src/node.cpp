@@ -385,7 +385,7 @@ Timer::SharedPtr Node::add_timer(
       }
     };
   one->follows_ros_time = [this, is_wall] {
-      const auto clock = get_clock();  // rclcpp raises if a clock of another type is asked
+      const auto clock = get_clock();  // rclcpp raises for a clock of another type
       return !is_wall && clock->get_clock_type() == RCL_ROS_TIME && clock->ros_time_is_active();
     };
   session_->entities.add(one);
@@ -436,7 +436,7 @@ void Node::keep_parameters()
       for (const auto & message : event.changed_parameters) {
         const auto parameter = rclcpp::Parameter::from_parameter_msg(message);
         if (parameter.get_type() == rclcpp::PARAMETER_NOT_SET) {
-          continue;  // of a source in Python of an earlier release
+          continue;  // from a Python source of an earlier release
         }
         if (!has_parameter(parameter.get_name())) {
           declare_parameter(parameter.get_name(), parameter.get_parameter_value());

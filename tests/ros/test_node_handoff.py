@@ -118,7 +118,7 @@ def test_a_shadow_that_misses_an_input_does_not_become_active(stage, pair, monke
     monkeypatch.setattr(pair.second._rosrm.entities.buffer, "misses_one", lambda topic: True)
     pair.conductor.say(C.SWITCH)
     report = pair.conductor.wait(2, R.FAILED)
-    assert "a message on /add did not come here" in report.message
+    assert "a message on /add did not arrive here" in report.message
     pair.conductor.say(C.RESUME)
     pair.conductor.wait(1, R.RESUMED)
     goes_on(stage, pair.counts)

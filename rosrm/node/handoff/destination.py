@@ -266,7 +266,8 @@ class Destination:
             self._end(
                 HandoffReport.FAILED,
                 f"more than {HISTORY} messages came on {topic}, which has several publishers, "
-                f"while no mark of the source came: which of them it has processed is not known",
+                f"while no mark of the source came, so it is not known which of them the source "
+                f"has processed",
             )
         return bool(topic)
 
@@ -328,10 +329,10 @@ class Destination:
                 return missing
         lossy = self._entities.input_with_gap()
         if lossy:
-            return f"until the state covers a message on {lossy} that did not come here"
+            return f"until the state covers a message on {lossy} that did not arrive here"
         unknown = self._entities.input_known(Known.GAP)
         if unknown:
-            return f"for marks that it missed: what has the source processed on {unknown}?"
+            return f"for a mark that names all messages on {unknown} that the source has processed"
         return ""
 
     def _missing_peers(self, mark: StateMark) -> str:
@@ -392,8 +393,8 @@ class Destination:
         if topic:
             self._end(
                 HandoffReport.FAILED,
-                f"marks of the source are missing, so which messages on {topic} it has processed "
-                f"is not known",
+                f"marks of the source are missing, so it is not known which messages on {topic} "
+                f"the source has processed",
             )
         return bool(topic)
 
@@ -403,7 +404,7 @@ class Destination:
         if lossy:
             self._end(
                 HandoffReport.FAILED,
-                f"a message on {lossy} did not come here, and the source has not processed it: "
+                f"a message on {lossy} did not arrive here, and the source has not processed it: "
                 f"its subscription needs a greater depth, or this host is too busy",
             )
         elif not self._ended and not self._is_unsure():

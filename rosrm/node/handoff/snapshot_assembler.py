@@ -21,8 +21,8 @@ class PartKey(NamedTuple):
 
     Attributes:
         size: bytes.
-        digest: BLAKE2b in hexadecimal digits. (A CRC would not do: a content that ends with its own
-            CRC, as those of many formats do, has always the same one.)
+        digest: BLAKE2b in hexadecimal digits. (A CRC is not enough: a content that ends with its
+            own CRC, as in many formats, always has the same CRC.)
     """
 
     size: int

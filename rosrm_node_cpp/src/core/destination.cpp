@@ -265,7 +265,7 @@ bool Destination::restore(Cut cut)
   return !has_lost_history();
 }
 
-/// Fail if nobody knows which messages of an input the source has processed.
+/// Fail if it is unknown which messages of an input the source has processed.
 bool Destination::has_lost_history()
 {
   const std::string topic = entities_.input_known(Known::kLost);
@@ -273,8 +273,8 @@ bool Destination::has_lost_history()
     end(
       Phase::kFailed,
       "more than " + std::to_string(kHistory) + " messages came on " + topic + ", which has "
-      "several publishers, while no mark of the source came: which of them it has processed is "
-      "not known");
+      "several publishers, while no mark of the source came, so it is not known which of them the "
+      "source has processed");
   }
   return !topic.empty();
 }
@@ -296,8 +296,8 @@ bool Destination::is_unsure()
   if (!topic.empty()) {
     end(
       Phase::kFailed,
-      "marks of the source are missing, so which messages on " + topic + " it has processed is "
-      "not known");
+      "marks of the source are missing, so it is not known which messages on " + topic + " the "
+      "source has processed");
   }
   return !topic.empty();
 }
@@ -370,11 +370,11 @@ std::string Destination::still_missing()
   }
   const std::string lossy = entities_.input_with_gap();
   if (!lossy.empty()) {
-    return "until the state covers a message on " + lossy + " that did not come here";
+    return "until the state covers a message on " + lossy + " that did not arrive here";
   }
   const std::string unknown = entities_.input_known(Known::kGap);
   return unknown.empty() ? "" :
-         "for marks that it missed: what has the source processed on " + unknown + "?";
+         "for a mark that names all messages on " + unknown + " that the source has processed";
 }
 
 /// Return the topic and number of peers matched with the source but not with this node.
@@ -457,7 +457,7 @@ void Destination::activate_if_complete()
   if (!lossy.empty()) {
     end(
       Phase::kFailed,
-      "a message on " + lossy + " did not come here, and the source has not processed it: its "
+      "a message on " + lossy + " did not arrive here, and the source has not processed it: its "
       "subscription needs a greater depth, or this host is too busy");
   } else if (!ended_ && !is_unsure()) {
     activate();

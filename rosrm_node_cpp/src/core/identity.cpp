@@ -11,7 +11,7 @@ namespace rosrm_node
 namespace
 {
 
-/// Most bytes of the file with the key of an instance.
+/// Maximum size in bytes of the file with the key of an instance.
 constexpr std::streamsize kLongestKey = 64;
 /// Most digits of an epoch.
 constexpr std::streamsize kEpochDigits = 20;

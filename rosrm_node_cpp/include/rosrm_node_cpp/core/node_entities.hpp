@@ -37,7 +37,7 @@ struct Input
   bool buffered = true;
   /// Every message counts, not only the newest: a reliable input with a depth above 1.
   bool wants_all = false;
-  /// Most messages that the reader keeps; 0: unlimited.
+  /// Maximum number of messages that the reader keeps; 0: unlimited.
   std::size_t depth = 0;
   /// Returns the number of matched publishers.
   std::function<std::uint32_t()> publishers;

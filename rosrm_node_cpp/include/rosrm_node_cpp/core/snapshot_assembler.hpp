@@ -20,7 +20,7 @@ namespace rosrm_node
 struct PartKey
 {
   std::uint64_t size = 0;
-  /// BLAKE2b in hexadecimal digits. (A CRC would not do: a content that ends with its own CRC, as
+  /// BLAKE2b in hexadecimal digits. (A CRC is not enough: a content that ends with its own CRC, as
   /// those of many formats do, has always the same one.)
   std::string digest;
 
