@@ -61,7 +61,7 @@ def shell_words(text: str, role: Role) -> tuple[str, ...]:
             kind == "double" and "\\\n" in found
         ):
             raise ValueError(
-                f"{text!r} has several lines, and a command has one. Write it on one line or as a "
+                f"{text!r} has several lines, but a command has one. Write it on one line or as a "
                 f"list of words, or {_in_a_shell(text)}"
             )
     found, advice = _syntax(outside, doubled, words, role)
@@ -78,10 +78,10 @@ def _syntax(outside: str, doubled: list[str], words: list[str], role: Role) -> t
         doubled: the parts in double quotes.
     """
     if role == "program" and (variable := _VARIABLE.match(outside)):
-        begins = f"begins with {variable[0]!r}, and only a shell sets a variable so"
+        begins = f"begins with {variable[0]!r}, which sets a variable only in a shell"
         return begins, ", or give the variable under `environment`"
     if role == "program" and words and words[0] in _OF_SHELLS:
-        return f"begins with {words[0]!r}, a command of shells and no program", ""
+        return f"begins with {words[0]!r}, which is a shell command, not a program", ""
     # The host replaces a `~` before a program, and rosrm one before a file.
     if found := _SYNTAX.search(f" {outside}" if role == "argument" else outside):
         remedy = f", or quote {found[0]!r} to pass it to the program as it is"

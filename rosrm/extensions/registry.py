@@ -263,7 +263,7 @@ class Registry:
             executor = self._guarded("migration", name, named, partial(getattr, strategy, named))
             if not (isinstance(executor, str) and executor in own):
                 there = ", ".join(sorted(own)) or "none"
-                fault = f"its `{named}` is {executor!r:.100}, no executor of its offer; "
+                fault = f"its `{named}` is {executor!r:.100}, which its offer lacks; "
                 raise self._fault("migration", name, f"{fault}there are: {there}")
 
     def declared(self, chosen: NameToOptions) -> Declared:

@@ -98,7 +98,7 @@ def test_what_cannot_be_read_as_a_file_is_refused_by_name(tmp_path):
 
 def test_a_file_that_is_too_large_is_refused_at_once(tmp_path):
     """A file that never ends is refused, too; none of it is read as YAML."""
-    with pytest.raises(ConfigError, match=r"/dev/zero: it has more than 16 MiB, and is probably"):
+    with pytest.raises(ConfigError, match=r"/dev/zero: it has more than 16 MiB, so it is probably"):
         read("/dev/zero")
 
 

@@ -660,11 +660,11 @@ def test_what_a_shell_would_read_is_pointed_out(refusal, text, found):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("|\n      echo a\n      echo b\n", "has several lines, and a command has one"),
+        ("|\n      echo a\n      echo b\n", "has several lines, but a command has one"),
         ("|\n      echo a \\\n      b\n", "has several lines"),
         ('|\n      echo "a \\\n      b"\n', "has several lines"),
-        ("RATE=3 play", "begins with 'RATE=', and only a shell sets a variable so"),
-        ("cd /tmp", "begins with 'cd', a command of shells and no program"),
+        ("RATE=3 play", "begins with 'RATE=', which sets a variable only in a shell"),
+        ("cd /tmp", "begins with 'cd', which is a shell command, not a program"),
         ("'echo \"$HOME/x\"'", "has '$HOME' in double quotes, where a shell would replace it"),
         ("'echo \"`date`\"'", "has '`' in double quotes"),
     ],

@@ -257,7 +257,7 @@ def test_the_answer_to_a_drain_says_what_cannot_leave_yet() -> None:
     cluster.set_host("b", "uncordon")
     unreachable = "each of p and q is unreachable; only a running process can be moved"
     said = cluster.set_host("a", "drain").message
-    unknown = "what else runs there is not known: it is lost"
+    unknown = "the other processes there are not known, because the host is lost"
     assert said == f"a is draining: 2 processes cannot leave yet: {unreachable}; {unknown}"
 
 
@@ -269,7 +269,8 @@ def test_the_answer_to_a_drain_of_a_lost_host_claims_nothing(then: HostLossActio
     (host,) = cluster.where("p")
     cluster.cut(host, seconds=10.0)
     said = cluster.set_host(host, "drain").message
-    assert said == f"{host} is draining: what runs there is not known: it is lost"
+    unknown = "the processes there are not known, because the host is lost"
+    assert said == f"{host} is draining: {unknown}"
     cluster.wait(3.0)
     assert not cluster.recorded("host_drained")
 

@@ -103,7 +103,7 @@ def _prepared(state: MasterState, targets: Sequence[Target], by: Requester) -> l
     given, most = sum(len(one.specs) for one in targets), state.settings.max_processes
     if given > most:  # before any of them is looked at
         raise RequestRefused(
-            f"{given} processes are requested at once, and the cluster may have {most} "
+            f"{given} processes are requested at once, but the cluster may have {most} "
             f"(`queue.max_processes`). Nothing was changed"
         )
     _refuse_twice(

@@ -395,7 +395,8 @@ def departures(state: MasterState, host: Host, now: float) -> str:
     if staying:
         phrases.append(f"cannot leave: {'; '.join(few(staying))}")
     if unreachable:
-        phrases.append(f"what {'else ' * bool(phrases)}runs there is not known: it {unreachable}")
+        unknown = f"the {'other ' * bool(phrases)}processes there are not known"
+        phrases.append(f"{unknown}, because the host {unreachable}")
     return "; ".join(phrases)
 
 

@@ -197,7 +197,7 @@ def _review(
             return None if before is None or now >= before.until else before
         if now < claim.deadline:
             return claim
-        why = f"room was made on {_name_of(claim)}, and the process was not placed in time"
+        why = f"room was made on {_name_of(claim)}, but the process was not placed in time"
         return _given_up(state, search, claim, why, now)
     if before is not None and claim is None and now < before.until:
         return before
@@ -245,7 +245,7 @@ def _wait_for_host(state: MasterState, search: _Search, claim: RoomMade, now: fl
         return replace(claim, until=now + _GRACE)
     if now < claim.until:
         return claim
-    why = f"room was made on {host.name}, and the process does not fit there"
+    why = f"room was made on {host.name}, but the process does not fit there"
     return _given_up(state, search, claim, why, now)
 
 
