@@ -27,7 +27,7 @@ class Ticket(NamedTuple):
     """Permission for requests to one service of one slave.
 
     Attributes:
-        until: time of the slave's monotonic clock at which the ticket expires, ns.
+        until: time of the slave's boot clock at which the ticket expires, ns.
         version: version of the master's keys at which the master made the ticket. When a key is
             revoked, tickets of earlier versions become invalid.
         service: name of the slave's service, for example "read_log".

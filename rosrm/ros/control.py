@@ -96,7 +96,7 @@ class RequestGate:
     """Admits or refuses requests of one sender at their receiver, and remembers answers.
 
     Args:
-        beat: the receiver's monotonic clock, ns.
+        beat: the receiver's boot clock, ns.
         max_age: seconds after which a request is stale.
         remembered: ids that are remembered at least.
         bound: of the remembered answers together. Beyond it, only the ids of the oldest stay.

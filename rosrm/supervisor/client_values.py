@@ -41,7 +41,7 @@ class LaunchOrder:
         memo: kept by the supervisor for a later run of the client; see `SupervisorClient.memos`.
         fence: rule by which the supervisor ends the instance without an order; None: never.
         limits: limits and scheduling.
-        last_contact: of the master with this host, monotonic; 0.0: now.
+        last_contact: of the master with this host, by the boot clock; 0.0: now.
         secrets: variable to the path of a file, which the supervisor reads at each start.
         adoption: the process that becomes the first run; None: the first run is started.
         slots: start once fewer than this number of other instances are active, that is, neither

@@ -74,8 +74,8 @@ class _Start:
     Attributes:
         attempt: the process.
         birth: of the process, in clock ticks.
-        late: monotonic time from which the start counts as one that waits for a path.
-        due: monotonic time at which the start fails.
+        late: boot time from which the start counts as one that waits for a path.
+        due: boot time at which the start fails.
     """
 
     def __init__(self, key: Key, program: spawn.Program, log: int, steps: Steps[Confined]) -> None:
@@ -439,7 +439,7 @@ class Server:
         send(start.attempt.pid, signal.SIGKILL)
 
     def _abandon_late(self, now: float) -> None:
-        """Report the starts that a path holds up."""
+        """Report the starts that have waited too long for a path."""
         for start in [one for one in self._starts.values() if one.due <= now]:
             if start.attempt.read():
                 continue  # this process was stopped, or the machine suspended: it is no longer late

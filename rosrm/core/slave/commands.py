@@ -52,7 +52,7 @@ class Renew:
         at: newest time at which the master received a message of this host.
         alive: time at which this slave runs.
 
-    Both by the monotonic clock.
+    Both by the boot clock.
     """
 
     at: float

@@ -7,7 +7,7 @@ from typing import Final
 #: Seconds by which a beat may be faster than the fastest one before it. The first one is in the
 #: answer to a handshake, which takes at most a few seconds.
 _FASTER: Final = 10.0
-#: Share by which one monotonic clock may run faster than another: twice the limit of `adjtimex`.
+#: Share by which one boot clock may run faster than another: twice the limit of `adjtimex`.
 _DRIFT: Final = 1e-3
 
 
@@ -15,7 +15,7 @@ class BeatClock:
     """Estimator of the send time of beats, which recognizes beats that waited in a socket.
 
     A slave that was stopped (SIGSTOP) finds old beats in its sockets. They name the silent hosts at
-    their send time, not now. The monotonic clocks of two machines share only their rate. So the
+    their send time, not now. The boot clocks of two machines share only their rate. So the
     fastest beat since the handshake gives the difference of the clocks. A beat with a longer
     transport was sent earlier by the additional time. The estimate is late only by the transport
     time of the fastest beat.

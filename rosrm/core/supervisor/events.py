@@ -42,7 +42,7 @@ class ContactReported(NamedTuple):
     """The client reported the time at which the master last received a message of this host.
 
     Attributes:
-        at: time of the last contact, by the monotonic clock.
+        at: time of the last contact, by the boot clock.
         alive: newest time at which the client itself ran.
     """
 

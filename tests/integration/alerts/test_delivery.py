@@ -166,7 +166,7 @@ def test_a_sink_that_hangs_is_named_once(outbox, caplog):
 
 
 def test_a_notice_that_cannot_be_removed_is_not_sent_again(receiver, outbox, caplog, monkeypatch):
-    """The receiver has taken it; a full disk must not repeat it with each attempt."""
+    """The receiver has taken the notice; a full disk must not cause further sends of it."""
     outbox.commit([("hook", notice(1)), ("hook", notice(2))], 2, {})
     attempts, is_full, delivered = [], [True], outbox.delivered
 

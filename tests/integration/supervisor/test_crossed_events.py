@@ -32,7 +32,7 @@ def stopped(pid: int) -> Iterator[None]:
 
 
 def test_a_client_may_leave_while_the_next_one_is_welcomed(host, client):
-    """The welcome notices that the former client is gone, whose own event is then the next one."""
+    """The welcome finds that the former client is gone; the event of that client comes next."""
     peer = endpoint.connect(str(host.state), 5.0)
     host.sleeper(client, "sleeps")  # the connection is accepted before
     with peer, stopped(client.pid):

@@ -203,7 +203,7 @@ class Cluster(World[Machine]):
         carried: every command that was carried out.
         watch: called with the commands of each step before they are carried out.
         boot: id of the boot of the master's machine.
-        clock_set_by: seconds by which the master's clock of the day was set.
+        clock_set_by: seconds by which the master's wall clock was set.
     """
 
     now = 100.0

@@ -263,7 +263,7 @@ def test_the_answer_to_a_drain_says_what_cannot_leave_yet() -> None:
 
 @pytest.mark.parametrize("then", ["elsewhere", "stop"])
 def test_the_answer_to_a_drain_of_a_lost_host_claims_nothing(then: HostLossAction) -> None:
-    """Its processes may still run there, also those that run elsewhere by now."""
+    """Processes may still run on the lost host, even if they run elsewhere by now."""
     cluster = Cluster("a", "b", suspect=1.0, lease=3.0)
     cluster.submit(process("p", host_loss=HostLossPolicy(then)))
     (host,) = cluster.where("p")

@@ -567,7 +567,7 @@ def test_an_unknown_move_in_the_journal_is_dropped() -> None:
 
 
 def test_the_source_of_a_dropped_move_has_its_restart_policy_again() -> None:
-    """The move had ordered its slave not to restart it."""
+    """The dropped move had ordered the slave not to restart the source."""
     cluster = two_hosts()
     begin(cluster, HandoffPhase.SHADOW)
     (source,) = cluster.machines["a"].programs.values()

@@ -76,7 +76,7 @@ def test_the_age_of_a_phase_is_not_that_of_a_clock_that_was_set(seconds: float) 
 
 
 @pytest.mark.parametrize("boot", ["another", ""])
-def test_after_a_boot_the_age_of_a_phase_is_that_of_the_clock_of_the_day(boot: str) -> None:
+def test_after_a_boot_the_age_of_a_phase_is_that_of_the_wall_clock(boot: str) -> None:
     """The boot clock began at zero again, or the boot of the journal is not known."""
     cluster = Cluster("a").with_processes(process("p"))
     since = cluster["p"].since

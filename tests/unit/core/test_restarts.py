@@ -70,7 +70,7 @@ def test_an_accepted_restart_that_the_slave_forgets_is_ordered_again() -> None:
 
 
 def test_a_requested_restart_survives_a_restart_of_the_master() -> None:
-    """The run for which it was meant is journaled."""
+    """The journal has the run for which the restart was meant."""
     cluster = Cluster("a").with_processes(process("p"))
     cluster.ask(happened.RestartRequested, ("p",), settle=False)
     cluster.restart_master()

@@ -137,7 +137,7 @@ def test_a_user_may_repeat_a_failed_move_at_once() -> None:
 
 
 def test_a_host_that_refused_a_process_is_tried_again_after_a_wait() -> None:
-    """Its disk was full, and the process has waited for another host since."""
+    """The disk of the host was full, and the process has waited for another host since."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.79, "cpu": 0.1}))
     cluster.machines["a"].refuses["p"] = "its artifact was not fetched: no space left on device"
     cluster.submit(process("p", memory=500))
@@ -150,7 +150,7 @@ def test_a_host_that_refused_a_process_is_tried_again_after_a_wait() -> None:
 
 
 def test_a_running_process_moves_to_a_host_that_has_refused_it_long_ago() -> None:
-    """Its move is tried again, too."""
+    """The master also tries moves to such a host again."""
     cluster = Cluster("a", Machine("b", busy={"memory": 0.3, "cpu": 0.1}))
     cluster.with_processes(movable("p"))
     cluster.machines["b"].refuses["p"] = "its artifact was not fetched: no space left on device"

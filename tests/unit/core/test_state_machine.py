@@ -794,7 +794,7 @@ class Play(RuleBasedStateMachine):
 
     @rule(seconds=st.sampled_from([-2e9, -3600.0, 5.0, 3600.0, 2e9]))
     def set_the_clock(self, seconds: float) -> None:
-        """Set the clock of the day of the master's machine; all durations stay as they are."""
+        """Set the wall clock of the master's machine; all durations stay as they are."""
         self.cluster.clock_set_by += seconds
         self.cluster.state.wall = self.cluster.wall
 

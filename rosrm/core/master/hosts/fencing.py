@@ -3,7 +3,7 @@
 A fence is a lease in the sense of Gray and Cheriton (1989), with one difference: the master need
 not answer each host. Its beats name the silent hosts. A beat that does not name a host proves that
 the master received a message from the host at most `suspect` seconds before. From that time the
-host counts by its own monotonic clock. Clocks may differ, but must run equally fast.
+host counts by its own boot clock. Clocks may differ, but must run equally fast.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 A host whose slave was stopped and left processes running is detached instead. Its processes
 follow the same lease (`host_loss`).
 
-The master judges ages by its own monotonic clock alone, and never by the ROS graph. A host that
+The master judges ages by its own clock alone, and never by the ROS graph. A host that
 declares a long report period gets additional time for a few reports.
 """
 
