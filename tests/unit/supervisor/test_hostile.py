@@ -321,7 +321,7 @@ def test_a_connection_without_a_free_descriptor_is_closed(server, tmp_path, monk
 
 
 def test_a_take_over_that_fails_serves_nobody(server, monkeypatch):
-    """To a slave, the instances that it left out would be lost; another supervisor tries again."""
+    """Otherwise a slave would lose the instances that it missed; another supervisor retries."""
 
     def fail(*_):
         raise OSError(errno.ENFILE, "Too many open files in system")
