@@ -478,7 +478,7 @@ def test_a_host_check_that_is_no_executor_of_the_offer_is_refused():
     able = SimpleNamespace(propose=None, host_check="m.abel", host_fault=max)
     offer = MigrationOffer("m", lambda options: able, executors={"m.able": dict})
     registry = registry_of(offer)
-    said = r"`host_check` is 'm\.abel', no executor .*are: m\.able"
+    said = r"`host_check` is 'm\.abel', which its offer lacks; there are: m\.able"
     with pytest.raises(PluginError, match=said):
         registry.migrations({"m": {}})
 
@@ -496,7 +496,7 @@ def test_a_host_check_that_cannot_be_read_is_the_plugins_fault():
     listed = SimpleNamespace(propose=None, host_check=["m.able"], host_fault=max)
     for strategy, said in (
         (Angry(), "its `host_check` raised OSError: no"),
-        (listed, r"its `host_check` is \['m.able'\], no executor"),
+        (listed, r"its `host_check` is \['m.able'\], which its offer lacks"),
     ):
         offer = MigrationOffer("m", lambda options, made=strategy: made)
         registry = registry_of(offer)
