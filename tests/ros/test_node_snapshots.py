@@ -227,7 +227,7 @@ def test_a_snapshot_that_would_fail_later_is_not_restored(stage, tmp_path, count
 
 
 def test_a_state_without_a_cycle_is_not_kept(stage, tmp_path, counter):
-    """The next start has it from the constructor; here the constructor may have failed halfway."""
+    """The next constructor makes this state again; this constructor may have failed halfway."""
     stage.remove(stage.instance(counter, 1, keep=tmp_path))
     assert reader.newest_head(tmp_path) is None
 
@@ -235,7 +235,7 @@ def test_a_state_without_a_cycle_is_not_kept(stage, tmp_path, counter):
 def test_a_node_at_its_limit_of_threads_works_and_keeps_its_state_later(
     stage, tmp_path, monkeypatch
 ):  # fmt: skip
-    """Its first cycle would end it, after each start again."""
+    """Otherwise the first cycle would end the node after each start."""
 
     def refused(*_, **__):
         raise RuntimeError("can't start new thread")
@@ -250,7 +250,7 @@ def test_a_node_at_its_limit_of_threads_works_and_keeps_its_state_later(
 def test_parameters_in_a_snapshot_of_an_earlier_release_are_not_set_for_ever(
     stage, tmp_path, monkeypatch
 ):  # fmt: skip
-    """It has all of them as set; those that the next instance has anyway can change later."""
+    """Such a snapshot marks all parameters as set; those with equal values can change later."""
 
     def tuned(number, gain):
         overrides = [Parameter("gain", value=gain)]
@@ -288,7 +288,7 @@ def refused(stage, tmp_path):
 
 
 def test_an_executor_of_several_threads_ends_with_a_failed_restore(stage, refused):
-    """It would report the error of a callback only after the next one, which never comes."""
+    """Otherwise the executor would report the error only after a further callback; none comes."""
     node = stage.instance(Refusing, 1, keep=refused)
     stage.executor.remove_node(node)
     executor = MultiThreadedExecutor(2, context=stage.context)
@@ -301,7 +301,7 @@ def test_an_executor_of_several_threads_ends_with_a_failed_restore(stage, refuse
 def test_a_process_that_catches_the_error_of_a_failed_restore_is_ended(
     stage, refused, monkeypatch
 ):  # fmt: skip
-    """It would look healthy, and neither work nor be restarted."""
+    """Otherwise the process would look healthy, and neither work nor be restarted."""
     codes: list[int] = []
     monkeypatch.setattr(restore, "_END_PATIENCE", 0.0)
     monkeypatch.setattr(restore.os, "_exit", codes.append)
@@ -317,7 +317,7 @@ def test_a_process_that_catches_the_error_of_a_failed_restore_is_ended(
 
 
 def test_a_component_whose_snapshot_cannot_be_restored_ends_no_other(stage, refused):
-    """Its process says why it is not loaded; in the executor, the error would end them all."""
+    """The process reports why its component is not loaded; other components continue."""
     log, make = stage.plain.get_logger(), lambda *_: Refusing(context=stage.context)
     links = ComponentLinks(str(refused), stage.executor, make, log)
     with connected(str(refused)) as connection:

@@ -98,7 +98,7 @@ class SnapshotRestore:
         self._start(mark)
 
     def _end_process(self) -> None:
-        """End a process that goes on after the error: it would look healthy, and do nothing.
+        """End a process that continues after the error: it would look healthy, and do nothing.
 
         An executor of several threads reports the error of a callback only after another one.
         """
