@@ -444,3 +444,19 @@ def test_once_there_is_room_again_every_state_is_kept_again(stage, tmp_path, cou
     stage.spin_until(lambda: kept_up_to(directory, 20), "a first state")
     first = reader.newest_head(directory).sequence
     stage.spin_until(lambda: kept_up_to(directory, first + 50), "states of later cycles")
+
+
+def test_the_last_state_is_written_once_there_is_room_though_no_cycle_follows(
+    stage, tmp_path, implementation, monkeypatch
+):
+    monkeypatch.setattr(writer, "_RETRY", 0.1)
+    directory = tmp_path / "state"
+    directory.write_text("in the way")
+    talker = stage.plain.create_publisher(Int64, "add", LATCHED)
+    idle = type("Idle", (Counting, implementation), {})
+    node = stage.instance(idle, 1, keep=directory, period=1000.0)
+    talker.publish(Int64(data=1))
+    stage.spin_until(lambda: node.total == 1, "the only cycle")
+    stage.spin(0.2)
+    directory.unlink()
+    stage.spin_until(lambda: kept_up_to(directory, 1), "the state")

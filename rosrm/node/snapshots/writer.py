@@ -29,6 +29,8 @@ from rosrm_msgs.msg import StateMark, StatePart
 _SHARE: Final = 0.02
 #: Seconds for the last snapshot at the end, first for its lock, then for its writing.
 _CLOSE_PATIENCE: Final = 5.0
+#: Seconds until a snapshot that cannot be written is tried again, unless there is a newer one.
+_RETRY: Final = 5.0
 #: Seconds between two log lines about the same fault.
 _LOGGED_EVERY: Final = 60.0
 
@@ -197,25 +199,38 @@ class _Writer:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._waiting is not None or self._ending)
-                waiting, self._waiting = self._waiting, None
+                waiting = self._waiting
             if waiting is None:
                 break
-            if not self._write(*waiting):
-                break
+            try:
+                if not self._write(*waiting):
+                    break
+            except OSError as error:
+                self._not_written(error)
+                with self._changed:
+                    is_newest = self._waiting is waiting
+                    if is_newest and self._ending:
+                        break
+                    if is_newest:
+                        self._changed.wait(_RETRY)
+                continue
+            with self._changed:
+                if self._waiting is waiting:
+                    self._waiting = None
         if self._slots is not None:
             self._slots.close()
 
     def _write(self, sequence: int, blocks: Sequence[Block]) -> bool:
-        """Write a snapshot; return False, to end the thread, if a newer instance writes there."""
+        """Write a snapshot; return False, to end the thread, if a newer instance writes there.
+
+        Raises:
+            OSError: the snapshot cannot be written.
+        """
         identity = self._entities.identity
-        try:
-            if self._slots is None:
-                self._slots = SlotWriter(Path(identity.keep), identity.process, identity.instance)
-            if self._slots.write(sequence, blocks):
-                self._written(sequence)
-                return True
-        except OSError as error:
-            self._not_written(error)
+        if self._slots is None:
+            self._slots = SlotWriter(Path(identity.keep), identity.process, identity.instance)
+        if self._slots.write(sequence, blocks):
+            self._written(sequence)
             return True
         self._warn(f"not saved any more: {identity.keep} is a newer instance's")
         return False
@@ -233,7 +248,7 @@ class _Writer:
             self._fault = str(error)
             self._warn(
                 f"not saved: {reason_of(error)}, in {self._entities.identity.keep}. The node "
-                f"continues, and retries with each newer state"
+                f"continues, and writes it again later"
             )
 
     def _warn(self, message: str) -> None:

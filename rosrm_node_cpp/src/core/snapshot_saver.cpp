@@ -76,6 +76,7 @@ void SnapshotSaver::keep(double now)
   } catch (const std::exception & error) {
     fail(error.what());
     next_ = now + every;
+    arm();  // perhaps no cycle follows
     return;
   }
   next_ = now + std::min(every, (entities_.middleware.now() - now) / kShare);
