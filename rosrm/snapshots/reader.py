@@ -27,7 +27,8 @@ SLOTS: Final = ("state.0", "state.1")
 COPY: Final = "copy"
 #: Flags of every file that is opened.
 OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
-_TOO_MANY_OPEN: Final = (errno.EMFILE, errno.ENFILE)
+#: Errors of a lack that ends: the file may be a snapshot.
+_FOR_NOW: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 #: Bytes that are read for a header; no header is larger.
 HEAD_ROOM: Final = 64 << 10
 
@@ -36,12 +37,12 @@ def peek(path: Path) -> Head | None:
     """Return the header of a file without reading its content; None: no such file, or no header.
 
     Raises:
-        OSError: too many files are open; the snapshot may be there.
+        OSError: too many files are open, or memory is short; the snapshot may be there.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
     except OSError as error:
-        if error.errno in _TOO_MANY_OPEN:
+        if error.errno in _FOR_NOW:
             raise
         return None
     try:
@@ -70,7 +71,7 @@ def newest_head(directory: Path) -> Head | None:
 
 
 def read(path: Path) -> Listing:
-    """Return the snapshot in a file; raises `Damaged`."""
+    """Return the snapshot in a file; raises the errors of `content_of`."""
     return decoded(content_of(path), path)
 
 
@@ -94,12 +95,19 @@ def checked_replica(path: Path) -> Head:
 
 
 def content_of(path: Path) -> bytes:
-    """Return all bytes of a file; raises `Damaged`."""
+    """Return all bytes of a file.
+
+    Raises:
+        Damaged: the file cannot be read.
+        OSError: too many files are open, or memory is short; the file may be sound.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
         with os.fdopen(descriptor, "rb") as file:
             return file.read(min(os.fstat(descriptor).st_size, LARGEST_REPLICA))
     except OSError as error:
+        if error.errno in _FOR_NOW:
+            raise
         raise Damaged(f"it cannot be read: {reason_of(error)}") from None
 
 

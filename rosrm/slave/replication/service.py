@@ -6,6 +6,8 @@ their results to the loop. So a slow disk, or a snapshot of many megabytes, dela
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import logging
 import queue
 from collections.abc import Callable, Sequence
@@ -18,11 +20,13 @@ from rosrm import clocks, threads
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
+from rosrm.slave.replication import fetch as fetching
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots.format import Head, TransferPart
 from rosrm.snapshots.reader import snapshot_files
 from rosrm.snapshots.writer import drop_snapshots
+from rosrm.wording import reason_of
 
 _log = logging.getLogger("rosrm.slave")
 
@@ -35,6 +39,10 @@ _REPORT_PERIOD: Final = 10.0
 _PART_TIMEOUT: Final = 1.0
 #: Seconds after which a transfer to a host that refused a snapshot is retried.
 _AGAIN: Final = 3.0
+#: Seconds until a search on this host is repeated that an error of a lack has ended.
+_SEARCH_AGAIN: Final = 1.0
+#: Errors of a lack, which may end at any moment.
+_OF_A_LACK: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
 #: Most parts from other hosts that wait for the thread.
 _MOST_WAITING: Final = 64
 #: Codes of failures of the network alone.
@@ -87,10 +95,12 @@ class _Found(NamedTuple):
     Attributes:
         head: its header; None: there is none.
         fault: why the replica on this host is not used; "": it is used, or there is none.
+        may_pass: an error of a lack is the reason, such as too many open files.
     """
 
     head: Head | None
     fault: str
+    may_pass: bool = False
 
 
 class ReplicationService:
@@ -117,8 +127,8 @@ class ReplicationService:
         self._transfers: dict[str, _Transfer] = {}
         #: Instances that wait for a snapshot; None: the local search is running.
         self._preparing: dict[InstanceId, Fetch | None] = {}
-        #: Instances whose local search, which also stores their keys, is running.
-        self._searching: set[InstanceId] = set()
+        #: Searches to repeat, with the time of each.
+        self._repeated: list[tuple[float, Callable[[], None]]] = []
         self._parts_waiting = 0
         self._snapshots = self._store.scan()
         self._reported: tuple[SnapshotReport, ...] | None = None
@@ -217,6 +227,10 @@ class ReplicationService:
         for fetch in list(self._preparing.values()):
             if fetch is not None:
                 fetch.advance(now)
+        due = [search for at, search in self._repeated if now >= at]
+        self._repeated = [one for one in self._repeated if now < one[0]]
+        for search in due:
+            search()
 
     def states(self) -> tuple[SnapshotReport, ...]:
         """Return the snapshots on this host, as of the last scan."""
@@ -361,34 +375,55 @@ class ReplicationService:
             return True
         self._preparing[assignment.instance] = None
         self._is_used = True
-        self._searching.add(assignment.instance)
-        unkeyed = replace(assignment, state_key=b"")  # the key stays in the store
-        self._in_thread(
-            partial(self._look_for, assignment),
-            lambda found: self._looked(unkeyed, found, done),
-            _Found(None, ""),
-        )
+        self._search(assignment, done, clocks.boot_time() + fetching.PATIENCE)
         return False
+
+    def _search(
+        self, assignment: Assignment, done: Callable[[Assignment], None], until: float
+    ) -> None:
+        """Search on this host; repeat until a time what an error of a lack ends."""
+        instance = assignment.instance
+        unkeyed = replace(assignment, state_key=b"")  # the key stays in the store
+
+        def looked(found: _Found) -> None:
+            now = clocks.boot_time()
+            if found.may_pass and now < until and instance in self._preparing:
+                again = partial(self._search, assignment, done, until)
+                self._repeated.append((now + _SEARCH_AGAIN, again))
+            else:
+                self._looked(unkeyed, found, done)
+
+        if instance in self._preparing:
+            self._in_thread(partial(self._look_for, assignment), looked, _Found(None, ""))
 
     def _look_for(self, assignment: Assignment) -> _Found:
         """Return the newest usable local snapshot, in the thread; delete unusable ones."""
         process, number = assignment.instance.process, assignment.instance.number
         self._store.make()  # the node creates its own directory below
         directory = self._store.directory(process)
-        if not assignment.shadow and any(
-            head.instance < assignment.snapshots_from for _, head in snapshot_files(directory)
-        ):
-            drop_snapshots(directory, assignment.snapshots_from - 1)
-        self._store.keys.put(process, number, assignment.state_key)
-        fault = self._store.open_replica(process, number)
-        return _Found(self._store.newest_readable(process), fault)
+        try:
+            if not assignment.shadow and any(
+                head.instance < assignment.snapshots_from for _, head in snapshot_files(directory)
+            ):
+                drop_snapshots(directory, assignment.snapshots_from - 1)
+            self._store.keys.put(process, number, assignment.state_key)
+            fault = self._store.open_replica(process, number)
+            return _Found(self._store.newest_readable(process), fault)
+        except OSError as error:
+            may_pass = error.errno in _OF_A_LACK
+            return _Found(self._readable_now(process), reason_of(error), may_pass)
+
+    def _readable_now(self, process: str) -> Head | None:
+        """Return the newest snapshot that can be read in spite of an error."""
+        with contextlib.suppress(OSError):
+            return self._store.newest_readable(process)
+        return None
 
     def _looked(
         self, assignment: Assignment, found: _Found, done: Callable[[Assignment], None]
     ) -> None:
         """Fetch a newer snapshot from another host, if there is one."""
         instance, hosts = assignment.instance, assignment.snapshot_hosts
-        self._searching.discard(instance)
         if found.fault:
             _log.info("the replica here is not used for %s: %s", instance, found.fault)
         if instance not in self._preparing:

@@ -179,6 +179,9 @@ class SnapshotStore:
 
         Returns:
             Why the replica is not used, as a sentence; "": it can be read, or is not needed.
+
+        Raises:
+            OSError: the replica cannot be read or written now; it stays.
         """
         directory = self.directory(process)
         path, key = directory / COPY, self.keys.of(process)
@@ -194,8 +197,6 @@ class SnapshotStore:
         except Damaged as fault:
             path.unlink(missing_ok=True)
             return str(fault)
-        except OSError as error:
-            return f"it cannot be written: {reason_of(error)}"
         path.unlink(missing_ok=True)
         return ""
 
@@ -320,7 +321,7 @@ class SnapshotStore:
         del self._incoming[part.process]
         try:
             self._check_and_store(part, coming)
-        except (Damaged, OSError):
+        except BaseException:  # also without memory its file is closed
             coming.writer.abandon()
             raise
         self._refreshed[part.process] = self._clock()

@@ -99,10 +99,14 @@ Head decoded_head(const Bytes & data)
 }
 
 /// Return at most some bytes of a file; empty: the file cannot be read.
+/// Throws std::system_error: it cannot be opened now, but may be a snapshot.
 Bytes content_of(const std::string & path, std::size_t most)
 {
   const int file = ::open(path.c_str(), O_RDONLY | kOpenFlags);
   if (file < 0) {
+    if (errno == EMFILE || errno == ENFILE || errno == ENOMEM) {
+      throw std::system_error(errno, std::generic_category(), path);
+    }
     return {};
   }
   struct stat status{};

@@ -207,7 +207,26 @@ def test_a_replica_that_cannot_be_written_for_the_node_stays(net, monkeypatch):
     start(net, "b", "b")
     assert state_for_node(net, "b") is None
     assert copy_of(net, "b").exists()
-    assert messages(net, "not used for p#9: it cannot be written: No space left on device")
+    assert messages(net, "not used for p#9: No space left on device")
+
+
+@pytest.mark.parametrize("lacks", [0, 1])
+def test_a_replica_waits_for_the_end_of_a_lack(net, monkeypatch, lacks):
+    """A start without the replica would lose the state: its own snapshots would be newer."""
+    monkeypatch.setattr(fetch, "PATIENCE", 10.0)
+    replicate(net, "b")
+    opened, right = [], os.open
+
+    def lacking(path, *rest) -> int:
+        if str(path).endswith(f"/{reader.COPY}"):
+            opened.append(path)
+            if len(opened) in (1 + lacks, 3):
+                raise OSError(errno.ENFILE, os.strerror(errno.ENFILE))
+        return right(path, *rest)
+
+    monkeypatch.setattr(os, "open", lacking)
+    start(net, "b", "b")
+    assert state_for_node(net, "b") == (7, 42)
 
 
 def test_an_own_snapshot_that_is_newer_stays(net):

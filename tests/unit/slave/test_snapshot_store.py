@@ -17,7 +17,7 @@ from rosrm.slave.replication.encryption import decrypted, encrypted
 from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, TransferPart, checked, encoded_head
-from rosrm.snapshots.writer import SlotWriter
+from rosrm.snapshots.writer import CopyWriter, SlotWriter
 from tests.limits import no_more_files
 
 #: The name that release 0.1.0 gave the directory of the process "map-server".
@@ -254,6 +254,19 @@ def test_without_descriptors_replicas_are_refused_and_none_is_reported_as_lost(s
             shelf.store.scan()
     assert [one.instance.process for one in shelf.store.scan()] == ["p"]
     assert shelf.send("q", 7) == ""
+
+
+def test_a_replica_that_cannot_be_checked_without_memory_leaves_no_open_file(shelf, monkeypatch):
+    """The sender tries again and again."""
+
+    def lack(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(CopyWriter, "check", lack)
+    before = open_files()
+    with pytest.raises(MemoryError):
+        shelf.send("p", 7)
+    assert open_files() == before
 
 
 # --- after an upgrade -------------------------------------------------------------------------
