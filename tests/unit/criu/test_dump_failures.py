@@ -226,3 +226,24 @@ def test_without_a_further_thread_the_receiving_end_is_closed_at_once(monkeypatc
     artifacts.remove_unused_later(Path("image"), 60.0)
     assert closed == [0.0]
     assert "_remove_if_idle in 60 s: can't start new thread" in caplog.text
+
+
+def test_a_node_that_cannot_be_called_back_leaves_no_other_one_away(tmp_path, process, monkeypatch):
+    """The others rejoin; the check of the host fails, and is repeated."""
+    called = []
+
+    def call_back(instance: str, _pid: int) -> None:
+        called.append(instance)
+        if instance == "p#1":
+            raise CriuError("p#1 is still being dumped")
+
+    monkeypatch.setattr(periodic, "_await_end_of_dump", call_back)
+    monkeypatch.setattr(periodic, "control_of", lambda _: tmp_path)
+    monkeypatch.setattr(periodic, "call_back", lambda *_: True)
+    for number in (1, 2):
+        (tmp_path / "images" / f"periodic-{number}").mkdir(parents=True)
+        (tmp_path / "images" / f"periodic-{number}" / "away").touch()
+    with pytest.raises(CriuError, match="p#1"):
+        periodic.call_back_all(tmp_path, {"p#1": process.pid, "p#2": process.pid})
+    assert called == ["p#1", "p#2"]
+    assert [path.parent.name for path in tmp_path.rglob("away")] == ["periodic-1"]

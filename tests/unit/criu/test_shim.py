@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import CriuError
-from rosrm_criu.engine import image, restore_result
+from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.restore_result import Outcome
 
 #: Exit code of a failed restore, as `shim.FAILED`.
@@ -80,3 +80,51 @@ def test_an_image_without_a_command_is_used_once(directory):
     assert ended.returncode == FAILED
     assert "was restored before" in ended.stderr
     assert restore_result.read(directory) == outcome
+
+
+#: Restores a process that ends with 7, as a child of the shim.
+_RESTORE = """
+import os, signal, sys, time
+from pathlib import Path
+from rosrm_criu.engine import process_tree, shim
+
+class Task:
+    directory = Path(sys.argv[1])
+
+    def run(self, marks):
+        self.root = os.fork()
+        if self.root == 0:
+            time.sleep(0.3 if BRIEF else 60.0)
+            os._exit(7)
+        print(self.root, flush=True)
+        return self.root
+
+    def report(self, root, *, namespace):
+        for child in process_tree.children(os.getpid()):
+            if child != root:
+                os.kill(child, signal.SIGKILL)
+"""
+
+
+def run(directory: Path, program: str) -> subprocess.CompletedProcess[str]:
+    words = [sys.executable, "-c", _RESTORE + program, str(directory)]
+    return subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_the_exit_code_arrives_though_the_guard_was_killed(directory):
+    ended = run(directory, "BRIEF = True\nshim._restore_as_child(Task())")
+    assert ended.returncode == 7
+
+
+def test_a_restored_process_without_a_guard_does_not_outlive_its_shim(directory):
+    """The host may have no room for one process more; the image stays for another attempt."""
+    refusing = """
+BRIEF = False
+def refused(root):
+    raise BlockingIOError(11, "Resource temporarily unavailable")
+shim._start_guard = refused
+shim._restore_as_child(Task())
+"""
+    ended = run(directory, refusing)
+    assert (ended.returncode, process_tree.is_alive(int(ended.stdout))) == (FAILED, False)
+    assert "temporarily unavailable" in restore_result.read(directory).reason

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ import time
 import pytest
 
 from rosrm.errors import PortableError
+from rosrm_criu.control import listener
 from rosrm_criu.control.client import (
     ask_prepare,
     ask_resume,
@@ -371,6 +373,24 @@ def test_a_node_without_its_directory_keeps_running(directory, node, capfd) -> N
     node.report(Status(State.LEFT, "m1"))
     assert node.status.state is State.LEFT
     assert "cannot be written" in capfd.readouterr().err
+
+
+def test_a_status_that_found_no_room_is_written_once_there_is(directory, node, monkeypatch) -> None:
+    """Otherwise no repeated request to join would find out that the node has joined."""
+    monkeypatch.setattr(listener, "_RETRY", 0.0)
+    ask_prepare(directory, None, "m1")
+    leave(node)
+    ask_resume(directory, None, "m1")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(listener, "write_message", full)
+        join(node)
+    ask_resume(directory, None, "m1")
+    assert node.next_request() is None
+    assert await_joined(directory, "m1", 0.0).state is State.RUNNING
 
 
 def test_an_orderly_end_leaves_no_portable_node(directory, node) -> None:

@@ -27,6 +27,8 @@ from rosrm_criu.control.messages import (
 _REMEMBERED: Final = 1000
 #: Seconds until the status is written again: cleaners of /tmp remove files that stay untouched.
 _FRESH: Final = 3600.0
+#: Seconds until a status that could not be written is written again.
+_RETRY: Final = 0.5
 
 
 class Listener:
@@ -48,13 +50,13 @@ class Listener:
         self._seen: Request | None = None
         self._edition: tuple[int, ...] = ()
         self._fault = ""
-        self._reported = 0.0
+        self._next_report = 0.0
         self.status = Status(State.JOINING)
         make_directory(directory)
 
     def next_request(self) -> Request | None:
         """Return the request that the node has to act on now; None: there is no new one."""
-        if clocks.boot_time() > self._reported + _FRESH:
+        if clocks.boot_time() >= self._next_report:
             self.report(self.status)
         request = self._read()
         if request is None or request == self._seen:
@@ -72,14 +74,15 @@ class Listener:
         return None
 
     def report(self, status: Status) -> None:
-        """Write the status. If that fails, log it; clients that wait have a timeout."""
+        """Write the status. If that fails, log it; `next_request` tries again."""
         if self.status.request not in ("", status.request):
             self._ended.append(self.status.request)
         self.status = status
-        self._reported = clocks.boot_time()
+        self._next_report = clocks.boot_time() + _FRESH
         try:
             write_message(self._directory, status)
         except OSError as error:
+            self._next_report = clocks.boot_time() + _RETRY
             self._log(f"{self._directory} cannot be written: {reason_of(error)}")
 
     def enter(self, state: State, request: str = "") -> None:

@@ -258,16 +258,16 @@ def _restore_as_child(task: _Restore) -> NoReturn:
     own = {name: os.environ.get(name, "") for name in (INSTANCE_MARK, SUPERVISOR_MARK)}
     try:
         root = task.run(own)
+        guard, guarding = _start_guard(root)
     except (CriuError, OSError) as error:
         process_tree.send(
             process_tree.tree(os.getpid())[1:], signal.SIGKILL
         )  # processes that CRIU had started
         _fail(task.directory, str(error))
-    guard, guarding = _start_guard(root)
     task.report(root, namespace=False)
     status = _attend(root, root)
-    os.write(guarding, b"ended")
-    with contextlib.suppress(ChildProcessError):  # already reaped: another process killed the guard
+    with contextlib.suppress(OSError):  # another process killed the guard, which may be reaped
+        os.write(guarding, b"ended")
         os.waitpid(guard, 0)
     _end_as(status)
 

@@ -46,8 +46,8 @@ def report_capability(arguments: Answer) -> Answer:
     artifacts.sweep(state, here["instances"])
     precopy.sweep(state)
     periodic.sweep(arguments)
-    periodic.call_back_all(state, here["pids"])
     reserve_all(state)
+    periodic.call_back_all(state, here["pids"])
     found = criu_support()
     if not found.works:
         raise CriuError(found.reason)

@@ -131,8 +131,10 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
         pids: leaders of the instances that run here, by `process#number`.
 
     Raises:
-        CriuError, PortableError: one of them is still being dumped, or cannot be called back.
+        CriuError, PortableError: one of them is still being dumped, or cannot be called back; all
+            others have been.
     """
+    faults: list[Exception] = []
     for instance, pid in pids.items():
         number = artifacts.number_of(instance)
         away = paths.periodic(state, number) / _AWAY
@@ -141,10 +143,13 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
         try:
             _await_end_of_dump(instance, pid)
             call_back(pid, control_of(pid), away.read_text(encoding="utf-8"))
-        except (CriuError, PortableError):
+        except (CriuError, PortableError, OSError) as fault:
             if process_tree.is_alive(pid):
-                raise
+                faults.append(fault)
+                continue
         away.unlink(missing_ok=True)
+    if faults:
+        raise faults[0]
 
 
 def _await_end_of_dump(instance: str, pid: int) -> None:
