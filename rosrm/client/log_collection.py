@@ -94,8 +94,10 @@ class LogCollector:
         """
         self._take(self._list(master))
         try:
-            self._collect_due(master)
-            self._archive.apply_limits()
+            try:
+                self._collect_due(master)
+            finally:  # a full disk may get room again only by the bounds
+                self._archive.apply_limits()
         except FileNotFoundError:  # a user removed files
             self._archive.read_again()
             raise

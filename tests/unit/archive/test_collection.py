@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import math
 import os
 import shutil
@@ -263,6 +264,26 @@ def test_a_full_disk_loses_and_doubles_nothing(rig, monkeypatch):
     monkeypatch.setattr(os, "write", real)
     rig.collect()
     assert rig.chunks() == [(0, b"one\ntwo\n")]
+
+
+def test_the_bounds_end_a_full_disk_that_one_look_has_filled(tmp_path, monkeypatch):
+    """One look may store more than the bound before the bounds are applied."""
+    rig = Rig(tmp_path, ArchiveLimits(5 * 8192, 1 << 40))
+    for number in range(1, 11):
+        rig.alpha.write(os.urandom(8000), number)
+        rig.alpha.ended.add((PROCESS, number))
+    append = writer._append
+
+    def bounded(path, content):
+        if sum(one.stat().st_size for one in rig.directory.rglob("*")) > 7 * 8192:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        append(path, content)
+
+    monkeypatch.setattr(writer, "_append", bounded)
+    with pytest.raises(OSError, match="No space left"):
+        rig.collect()
+    rig.collect()
+    assert len(rig.chunks(10, most=8000)[0][1]) == 8000
 
 
 def test_a_file_that_somebody_removes_is_collected_again(rig):
