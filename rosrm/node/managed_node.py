@@ -231,8 +231,12 @@ class NodeEntities:
         result = callback(*arguments)
         self.in_cycle = False
         self.sequence += 1
-        self.on_cycle()
-        self._replay.after_cycle()
+        try:
+            self.on_cycle()
+            self._replay.after_cycle()
+        except Exception:  # a signal, or the author, may shut ROS down while a callback runs
+            if self.node.context.ok():
+                raise
         return result
 
     def _received(self, one: Input, message: Any, info: Any) -> None:

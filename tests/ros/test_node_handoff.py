@@ -272,3 +272,22 @@ def test_a_lifecycle_node_can_be_made_migratable(stage):
     node.trigger_activate()
     node.output.publish(Int64(data=2))
     stage.spin_until(lambda: numbers(heard) == [2], "what was published when active", PATIENCE)
+
+
+def test_a_node_that_shuts_ros_down_in_a_cycle_ends_in_order(stage, pair):
+    """A job with a standby may end in this way; an error would make it a failed one."""
+    pair.conductor.say(C.SHADOW)
+    pair.conductor.wait(2, R.SHADOWING)
+    source, entities = pair.first, pair.first._rosrm.entities
+    stage.spin_until(lambda: source._rosrm._source._attached, "the successor")
+    before = entities.sequence
+    with entities.turn:
+        entities._cycle(stage.context.shutdown)
+    assert entities.sequence == before + 1
+
+
+def test_a_fault_of_the_state_ends_no_cycle_before_the_shutdown_alone(stage, pair, monkeypatch):
+    """While ROS runs, an error of rosrm itself is not hidden."""
+    monkeypatch.setattr(pair.first._rosrm.entities, "on_cycle", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        stage.spin_until(lambda: False, "the error")
