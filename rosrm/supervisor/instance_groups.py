@@ -32,8 +32,6 @@ _WALKS: Final = 20
 _REMOVE_AGAIN: Final = 0.2
 #: Links of a folder without folders in it.
 _LINKS: Final = 2
-#: Errors of a system without room for another descriptor.
-_NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 #: Bytes; a limit above this is none (version 1 writes 2**63 less a page).
 _NO_LIMIT: Final = 2**62
 
@@ -317,7 +315,7 @@ def pids(group: str) -> list[int]:
         # More links: a process of the instance has made groups.
         below = _folders_in(group) if os.stat(group).st_nlink > _LINKS else ()
     except OSError as error:
-        if error.errno in _NO_ROOM:
+        if error.errno in procfs.NO_ROOM:
             raise
         return []
     for name in below:

@@ -62,11 +62,17 @@ def read(state: str) -> ContactReported:
     """Return the times stored since this machine's start; `-inf`: none.
 
     The times of a fence that was due before that start are negative, so 0.0 would be newer.
+
+    Raises:
+        OSError: the system has no room for another descriptor; older times would end a process.
     """
     try:
         with open(os.path.join(state, paths.HEARD), encoding="ascii") as file:
             boot, at, alive = file.read(100).split()
         newest = ContactReported(float(at), float(alive))
-    except (OSError, ValueError):
+    except OSError as error:
+        procfs.check_room(error)
+        return _NONE
+    except ValueError:
         return _NONE
     return newest if boot == procfs.boot_id() else _NONE

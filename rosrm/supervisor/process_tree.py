@@ -78,15 +78,22 @@ class ProcessTrees:
         """Add a leader that this supervisor did not spawn; return False if it has ended.
 
         An earlier supervisor spawned it, or it is adopted.
+
+        Raises:
+            OSError: the system has no room for a look.
         """
         try:
             pidfd = procfs.open_pidfd(leader.pid) if self._has_room() else _NO_PIDFD
         except ProcessLookupError:
             return False
-        now = procfs.read_stat(leader.pid)
-        if now is None or not procfs.was_born(now, leader.start):
-            if pidfd != _NO_PIDFD:
+        is_same = False
+        try:
+            now = procfs.read_stat(leader.pid)
+            is_same = now is not None and procfs.was_born(now, leader.start)
+        finally:
+            if not is_same and pidfd != _NO_PIDFD:
                 os.close(pidfd)
+        if not is_same:
             return False  # it ended, and its pid was given to another process
         self._taken_over[leader.pid] = pidfd
         self._add(key, leader.pid, leader.start)
@@ -99,6 +106,9 @@ class ProcessTrees:
         """Find the ends of the processes that have no descriptor; called in each round.
 
         Do also what an error of the system has prevented before.
+
+        Raises:
+            OSError: the system has no room for a look; a later one continues.
         """
         self._report_ends()
         for key in [key for key, watched in self._strays.items() if not watched]:
@@ -303,9 +313,11 @@ class ProcessTrees:
         if session in self._children or session in self._taken_over:
             self._signal_leader(key, session, number)
         if key in self._strays:
-            self.watch_strays(key, self._find(key))
-            for pid, pidfd in self._strays.get(key, {}).items():
-                _send_to(pid, pidfd, number)
+            try:
+                self.watch_strays(key, self._find(key))
+            finally:  # without room for a look the known ones get it all the same
+                for pid, pidfd in self._strays.get(key, {}).items():
+                    _send_to(pid, pidfd, number)
 
     def _signal_leader(self, key: Key, leader: int, number: int) -> None:
         """Send a signal to the process group of a leader.
@@ -317,8 +329,10 @@ class ProcessTrees:
         if key not in self._in_foreign_session:
             _note(send_to_group(leader, number), number, f"the group {leader}")
             return
-        self.watch_strays(key, _below(leader))
-        _send_to(leader, self._taken_over[leader], number)
+        try:
+            self.watch_strays(key, _below(leader))
+        finally:
+            _send_to(leader, self._taken_over[leader], number)
 
     def kill(self, found: Iterable[Stat]) -> None:
         """Send SIGKILL to processes that belong to no instance any more."""

@@ -29,6 +29,8 @@ _EXECVE: Final = 1.0
 _LOOK: Final = 0.001
 #: Most bytes of one read.
 _PART: Final = 1 << 16
+#: Errors of a system without room for another descriptor: the process may run.
+NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 class Stat(NamedTuple):
@@ -54,11 +56,16 @@ class Stat(NamedTuple):
 
 
 def read_stat(pid: int) -> Stat | None:
-    """Return the fields of /proc/PID/stat; None: there is no such process."""
+    """Return the fields of /proc/PID/stat; None: there is no such process.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         with open(f"/proc/{pid}/stat", "rb") as file:
             text = file.read()
-    except OSError:
+    except OSError as error:
+        check_room(error)
         return None
     # The second field, the name in brackets, may itself hold spaces and brackets.
     fields = text[text.rindex(b")") + 2 :].split()
@@ -66,6 +73,12 @@ def read_stat(pid: int) -> Stat | None:
         pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19]),
         int(fields[6]),
     )  # fmt: skip
+
+
+def check_room(error: OSError) -> None:
+    """Raise an error that does not tell that a process has ended, or may not be read."""
+    if error.errno in NO_ROOM:
+        raise error
 
 
 def content(path: str) -> bytes:
@@ -163,10 +176,15 @@ def _has_no_environment(pid: int) -> bool:
 
 
 def read_marks(pid: int) -> tuple[str, str]:
-    """Return instance and supervisor from a process's environment; "" for each that is missing."""
+    """Return instance and supervisor from a process's environment; "" for each that is missing.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         variables = read_environment(pid)
-    except OSError:
+    except OSError as error:
+        check_room(error)
         return "", ""
     marks = {}
     for variable in variables:
@@ -179,7 +197,11 @@ def read_marks(pid: int) -> tuple[str, str]:
 
 
 def everyone() -> Iterator[Stat]:
-    """Yield every living process; a walk over /proc, so only for rare occasions."""
+    """Yield every living process; a walk over /proc, so only for rare occasions.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     for name in os.listdir("/proc"):
         if name.isdigit():
             stat = read_stat(int(name))
@@ -237,7 +259,11 @@ def own_children() -> list[int]:
 
 
 def descendants(pid: int) -> list[int]:
-    """Return the pids of a process's children, of their children, and so on; not its own."""
+    """Return the pids of a process's children, of their children, and so on; not its own.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     found = [pid]
     for one in found:  # grows
         found += _children_of(one)
@@ -249,8 +275,11 @@ def _children_of(pid: int) -> list[int]:
     found: list[bytes] = []
     for thread in _threads_of(pid):
         children = f"/proc/{pid}/task/{thread}/children"
-        with contextlib.suppress(OSError), open(children, "rb") as file:  # it may have ended
-            found += file.read().split()
+        try:
+            with open(children, "rb") as file:
+                found += file.read().split()
+        except OSError as error:  # it may have ended
+            check_room(error)
     return [int(child) for child in found]
 
 
@@ -258,26 +287,37 @@ def _threads_of(pid: int) -> list[str]:
     """Return the ids of the threads of a process; [] if it has ended."""
     try:
         return os.listdir(f"/proc/{pid}/task")
-    except OSError:
+    except OSError as error:
+        check_room(error)
         return []
 
 
 def command_line(pid: int) -> list[str]:
-    """Return the words of a process's command line; [] if it has none, or has ended."""
+    """Return the words of a process's command line; [] if it has none, or has ended.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         with open(f"/proc/{pid}/cmdline", "rb") as file:
             text = file.read()
-    except OSError:
+    except OSError as error:
+        check_room(error)
         return []
     return [os.fsdecode(word) for word in text.removesuffix(b"\0").split(b"\0")] if text else []
 
 
 def user_ids(pid: int) -> set[int]:
-    """Return the real, effective and saved user id of a process; empty if it has ended."""
+    """Return the real, effective and saved user id of a process; empty if it has ended.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         with open(f"/proc/{pid}/status", "rb") as file:
             text = file.read()
-    except OSError:
+    except OSError as error:
+        check_room(error)
         return set()
     line = next(line for line in text.splitlines() if line.startswith(b"Uid:"))
     return {int(word) for word in line.split()[1:4]}

@@ -9,6 +9,7 @@ import pytest
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.supervisor import lease_file
 from rosrm.supervisor.file_thread import FileThread
+from tests.limits import no_more_files
 from tests.waiting import PATIENCE
 
 DISK = FileThread("the state directory", patience=PATIENCE)
@@ -48,3 +49,11 @@ def test_a_lease_file_that_cannot_be_written_is_logged_once(tmp_path, capfd):
         kept.keep(ContactReported(at))
         DISK.ask(lambda: None)
     assert capfd.readouterr().err.count("heard cannot be written: Is a directory") == 1
+
+
+def test_a_lease_file_that_cannot_be_opened_now_is_not_left_out(tmp_path):
+    """Older times would fence a process whose host is in contact; the supervisor starts again."""
+    lease_file.LastContact(str(tmp_path), DISK).keep(ContactReported(5.0))
+    DISK.ask(lambda: None)
+    with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+        lease_file.read(str(tmp_path))

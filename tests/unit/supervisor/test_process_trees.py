@@ -9,6 +9,8 @@ import selectors
 import signal
 import subprocess
 
+import pytest
+
 from rosrm.core.supervisor.events import Exited, SessionEnded, SpawnFailed
 from rosrm.core.supervisor.instance import UNKNOWN_EXIT, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
@@ -19,6 +21,7 @@ from rosrm.supervisor.instance_groups import InstanceGroups, group_name
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
+from tests.limits import no_more_files
 
 TALKER = ("talker", 7)
 
@@ -83,6 +86,39 @@ def test_leaders_without_a_free_descriptor_are_taken_over(tmp_path, monkeypatch)
     its.look(3.0)
     assert [one.instance for one in happened] == [("sleep", 2), ("sleep", 1)]
     assert its.deadline() is None
+
+
+def test_a_process_that_cannot_be_looked_at_now_has_not_ended(tmp_path, monkeypatch):
+    """Processes are looked at only where descriptors are short; a false end would restart them."""
+    monkeypatch.setattr(descriptors, "most_watched", lambda: 0)
+    happened: list[object] = []
+    its = trees(str(tmp_path), happened)
+    with subprocess.Popen(["sleep", "100"], start_new_session=True) as sleeper:
+        try:
+            assert its.take_over(TALKER, procfs.read_stat(sleeper.pid))
+            with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+                its.look(1.0)
+            its.look(2.0)
+            assert happened == []
+        finally:
+            sleeper.kill()
+    its.look(3.0)
+    assert happened == [Exited(TALKER, UNKNOWN_EXIT)]
+
+
+def test_without_a_look_for_others_the_known_processes_get_a_signal(tmp_path, monkeypatch):
+    """A SIGKILL that reaches none of them would not be sent again."""
+    its = trees(str(tmp_path), [])
+    with subprocess.Popen(["sleep", "100"]) as adopted, subprocess.Popen(["sleep", "100"]) as stray:
+        try:
+            assert its.take_over(TALKER, procfs.read_stat(adopted.pid))
+            its.watch_strays(TALKER, [procfs.read_stat(stray.pid)])
+            with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+                its.signal(TALKER, signal.SIGKILL)
+            assert adopted.wait(timeout=20.0) == -signal.SIGKILL
+        finally:
+            adopted.kill()
+            stray.kill()
 
 
 def test_strays_beyond_the_descriptors_are_found_when_a_watched_one_ends(tmp_path, monkeypatch):
