@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
@@ -28,6 +29,8 @@ _IDLE: Final = 60.0
 #: Most uploads at a time.
 _MOST_UPLOADS: Final = 16
 _PART: Final = ".part"
+#: Errors of a machine without room for another open file, which pass.
+_NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 @dataclass(slots=True)
@@ -119,7 +122,7 @@ class ArtifactStore:
         """Return the size of an archive, and at most `most` of its bytes.
 
         Raises:
-            Refused: it is not stored, or cannot be read.
+            Refused: it is not stored, or cannot be read; "busy": only now.
         """
         size = self._sizes.get(digest)
         if size is None:
@@ -132,6 +135,9 @@ class ArtifactStore:
                 file.seek(offset)
                 return size, file.read(max(0, min(most, size - offset)))
         except OSError as error:
+            if error.errno in _NO_ROOM:
+                why = f"the master cannot read an artifact now: {reason_of(error)}"
+                raise Refused(why, "busy") from None
             self._sizes.pop(digest, None)
             raise Refused(
                 f"the master cannot read the artifact {digest[:12]} ({reason_of(error)}); submit "

@@ -9,6 +9,7 @@ import pytest
 from rosrm.artifacts.store import ArtifactStore
 from rosrm.errors import Refused
 from rosrm.model.ledger import Store, bound_of
+from tests.limits import no_more_files
 
 NONE: frozenset[str] = frozenset()
 
@@ -164,6 +165,16 @@ def test_a_restart_keeps_what_is_complete(store, tmp_path, clock):
     again = ArtifactStore(tmp_path / "store", 10_000, clock)
     assert again.has(digest, 4000)
     assert files(tmp_path) == {digest}
+
+
+def test_contents_that_cannot_be_read_now_stay(store):
+    """A host asks again; a process is submitted again only if its contents are lost."""
+    digest, data = data_of(1)
+    put(store, data)
+    with no_more_files(), pytest.raises(Refused, match="Too many open files") as refusal:
+        store.read(digest, 0, 100)
+    assert refusal.value.code == "busy"
+    assert store.read(digest, 0, 100) == (4000, data[:100])
 
 
 def test_contents_that_vanished_are_unknown(store, tmp_path):
