@@ -67,11 +67,15 @@ def _listed(program: str, label: str) -> list[str]:
 
 
 def _running() -> Iterator[str]:
-    """Yield the names of containers of which `podman run`, or this program, runs now."""
+    """Yield the names of containers of which `podman run`, or this program, runs now.
+
+    Raises:
+        OSError: a process cannot be looked at; its container is not to be removed for that.
+    """
     for file in Path("/proc").glob("[0-9]*/cmdline"):
         try:
             words = file.read_bytes().split(b"\0")
-        except OSError:  # the process has ended
+        except (FileNotFoundError, ProcessLookupError, PermissionError):  # ended, or of another
             continue
         names = (word for word in words if word.startswith(b"--name=rosrm-"))
         yield from (os.fsdecode(name.partition(b"=")[2]) for name in names)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import subprocess
@@ -13,6 +14,7 @@ import pytest
 
 from rosrm.extensions.contracts import Launch, LauncherContext
 from rosrm.model.values import Assignment, Container, InstanceId, ProcessSpec
+from rosrm_container import start
 from rosrm_container.podman import Podman
 
 SPEC = ProcessSpec("p", command=("run", "-v"), container=Container("ros:jazzy", "podman"))
@@ -119,3 +121,14 @@ def test_the_key_of_the_instance_is_mounted_and_in_no_variable(launcher, tmp_pat
     left_over.touch()
     subprocess.run(launch.argv, env={**os.environ, **launch.environment}, check=False, timeout=60)
     assert not left_over.exists()
+
+
+def test_a_container_whose_process_cannot_be_looked_at_is_not_removed(monkeypatch):
+    """The system may have no room for another open file; the start is then tried again."""
+
+    def full(_: Path) -> bytes:
+        raise OSError(errno.ENFILE, os.strerror(errno.ENFILE))
+
+    monkeypatch.setattr(Path, "read_bytes", full)
+    with pytest.raises(OSError, match="Too many open files"):
+        list(start._running())
