@@ -174,14 +174,24 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         _note_start(state, process, status, now)
     adoption.note_running(state, process, instance)
     _note_restarts(state, process, status, before, pid)
+    if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
+        _requeue_for_standby(state, process)
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_owner(state, process, instance, now)
         if not instance.stopping:
             return
-    if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
-        stop_instance(state, instance, now)  # the standby is ready sooner, and has the snapshot
     if process.name not in state.migrations:
         _follow(state, process, instance, status, now, repeated=before is status.state)
+
+
+def _requeue_for_standby(state: MasterState, process: Process) -> None:
+    """Request the stop of a primary in back-off: its standby is ready sooner, and has its state.
+
+    The journal has this request, because a later master would take the ordered end for a failure.
+    """
+    if process.wanted is DesiredState.RUN:
+        process.wanted = DesiredState.REQUEUE
+        state.save(process)
 
 
 def _note_start(

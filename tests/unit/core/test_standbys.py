@@ -266,6 +266,50 @@ def test_a_restarted_master_keeps_the_standby() -> None:
     assert (cluster.phase("p"), cluster["p"].owner) == ("running", 2)
 
 
+@pytest.mark.parametrize("first", ["primary", "standby"])
+@pytest.mark.parametrize("why_not", ["", "no state", "restarted"])
+def test_a_standby_takes_over_from_a_primary_that_ended_without_a_master(
+    why_not: str, first: str
+) -> None:
+    """Whichever host reports first to the next master; one without the newest state fails."""
+    cluster = with_standby(
+        quirk=why_not if why_not == "no state" else "", restart=RestartPolicy("on-failure")
+    )
+    machine = cluster.machines["a"]
+    cluster.kill_master()
+    if why_not == "restarted":
+        machine.finish("p", cluster.now, code=3)
+    machine.programs[machine.find("p")].restart = RestartPolicy("never")
+    machine.finish("p", cluster.now, code=3)
+    machine.connected = first == "primary"
+    for one in cluster.machines.values():
+        if one.connected:
+            cluster.register(one)
+            cluster.wait(1.0)
+    cluster.rejoin("a", seconds=30.0)
+    found = cluster.phase("p"), cluster.active(), cluster["p"].exit_code
+    assert found == (("failed", [], 3) if why_not else ("running", ["b"], None))
+
+
+def test_a_primary_that_was_stopped_for_its_standby_has_not_failed_for_the_next_master() -> None:
+    """The standby cannot take over; so the process, which its policy restarts, is queued again."""
+    cluster = with_standby(restart=RestartPolicy("on-failure"))
+    machine = cluster.machines["a"]
+    status = machine.slave.held[machine.find("p")].status
+    del machine.programs[status.instance]
+    for state in (InstanceState.BACKOFF, InstanceState.EXITED):
+        one = machine.ends[status.instance] = replace(status, state=state, pid=0, exit_code=3)
+        machine._supervisor_says(one, cluster.now)
+        if state is InstanceState.BACKOFF:
+            cluster.tell(machine.status_batches.popleft())  # the order to stop follows
+    cluster.kill_master()
+    cluster.machines["b"].quirks["p"].add("deaf")
+    for other in cluster.machines.values():
+        cluster.register(other)
+    cluster.wait(30.0)
+    assert cluster.phase("p") == "running"
+
+
 def test_a_restart_by_request_causes_no_take_over() -> None:
     """The primary restarts on its host without a failover."""
     cluster = with_standby()

@@ -34,14 +34,21 @@ def is_ready(state: MasterState, process: Process) -> bool:
     return reports is not None and ReportPhase.READY in reports.phases
 
 
-def _has_state(state: MasterState, process: Process) -> bool:
-    """Return True if a process has a standby with a state of its primary, ready or not.
+def _has_state(state: MasterState, process: Process, end: End) -> bool:
+    """Return True if a process that has ended has a standby with its state, ready or not.
 
     Without its primary such a standby becomes no readier, and each snapshot is older than its
     state. It may still wait for a peer that ended with the primary.
+
+    A standby of a former master that has not reported to this one yet may have a state. If it has
+    none, its order to take over times out, and the end of the primary counts as without a standby.
+    A restart of the primary that no master has seen would leave it the state of the former run.
     """
     reports = _reports_of_standby(state, process)
-    return reports is not None and reports.sequence > 0
+    if reports is None or reports.sequence > 0:
+        return reports is not None
+    is_unheard = not reports.phases and state.standbys[process.name].started <= state.restored_at
+    return is_unheard and not end.gone and end.status.restarts == process.restarts
 
 
 def _reports_of_standby(state: MasterState, process: Process) -> HandoffReports | None:
@@ -51,9 +58,9 @@ def _reports_of_standby(state: MasterState, process: Process) -> HandoffReports 
         return None
     if process.wanted is DesiredState.CANCEL:
         return None
-    reports = standby.handoff_reports.get(standby.destination.number)
+    reports = standby.handoff_reports.get(standby.destination.number, HandoffReports())
     instance = state.instances.get(standby.destination.number)
-    if reports is None or instance is None or instance.stopping:
+    if instance is None or instance.stopping:
         return None
     return None if reports.phases.keys() & _NOT_FOLLOWING else reports
 
@@ -75,7 +82,7 @@ def take_over(state: MasterState, process: Process, end: End, now: float) -> boo
         False: no standby has the state, or the primary has completed as intended.
     """
     succeeded = end.status.succeeded and not end.ordered and not end.gone
-    if succeeded or not (is_ready(state, process) or _has_state(state, process)):
+    if succeeded or not (is_ready(state, process) or _has_state(state, process, end)):
         return False
     migration = state.standbys.pop(process.name)
     migration.ended[migration.source.number] = end
