@@ -21,7 +21,7 @@ from rosrm.core.master.state.demand import Demand, RankingKey
 from rosrm.core.master.state.flows import Flows
 from rosrm.core.master.state.gangs import Gangs
 from rosrm.core.master.state.host_arrays import FloatArray
-from rosrm.core.master.state.hosts import Host, HostTable
+from rosrm.core.master.state.hosts import Host, HostCondition, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.intents import Unsaved, mode_intent, modes_intent, version_intent
 from rosrm.core.master.state.journal_gap import JournalGap
@@ -304,6 +304,12 @@ class MasterState:
         self.missing_since.pop(host.column, None)
         self.hosts.set_report_due(host, report_due=False)
         host.unreached = False
+
+    def knows_statuses(self, host: Host) -> bool:
+        """Return True if a host is up, and no status of its instances is known to be missing."""
+        column = host.column
+        is_up = self.hosts.condition_of(host) is HostCondition.UP
+        return is_up and column not in (*self.reports_awaited, *self.hosts.statuses_missing())
 
     # --- processes -----------------------------------------------------------------------
 

@@ -70,11 +70,7 @@ def review(state: MasterState, instance: Instance, now: float) -> None:
 
 def _may_be_ordered(state: MasterState, owner: Instance) -> bool:
     """Return True if the newest status of the owner is known, so that it is not restarted twice."""
-    column = owner.host.column
-    if owner.id.process in state.migrations or column in state.reports_awaited:
-        return False
-    is_up = state.hosts.condition_of(owner.host) is HostCondition.UP
-    return is_up and column not in state.hosts.statuses_missing()
+    return owner.id.process not in state.migrations and state.knows_statuses(owner.host)
 
 
 def note_status(state: MasterState, instance: Instance, status: InstanceStatus) -> None:

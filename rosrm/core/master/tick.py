@@ -142,12 +142,8 @@ def _never_arrived(state: MasterState, instance: Instance, age: float) -> bool:
         return False
     if instance.id.process in state.migrations or instance.id.process in state.standbys:
         return False  # their plans have their own time-outs
-    if state.hosts.condition_of(host) is not HostCondition.UP:
-        return False
-    return host.unreached or host.column not in (
-        *state.reports_awaited,
-        *map(int, state.hosts.statuses_missing()),
-    )
+    is_up = state.hosts.condition_of(host) is HostCondition.UP
+    return is_up and (host.unreached or state.knows_statuses(host))
 
 
 def _give_up(state: MasterState, instance: Instance, age: float, now: float) -> None:

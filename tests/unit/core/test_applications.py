@@ -454,6 +454,21 @@ def test_a_new_version_of_a_service_that_finishes_is_given_up() -> None:
     assert given_up == "p: it has finished, but is a service"
 
 
+def test_a_new_version_is_not_well_while_its_host_is_silent() -> None:
+    """It crashed in the silence: its host reports that only after `healthy_for`."""
+    cluster = Cluster("a")
+    spec = movable("p", restart=RestartPolicy("on-failure"))
+    cluster.apply("nav", spec)
+    cluster.wait(1.0)
+    cluster.apply("nav", new(spec), healthy_for=3.0)
+    cluster.wait(1.0)
+    cluster.machines["a"].connected = False
+    cluster.machines["a"].finish("p", cluster.now, code=3)
+    cluster.wait(6.0)
+    cluster.reconnect("a", seconds=10.0)
+    assert (program(cluster, "p"), state_of(cluster)) == (("run", "it"), (1, []))
+
+
 def test_the_same_request_in_the_middle_changes_nothing() -> None:
     """The new version is watched for `healthy_for` from its start on, and given up if it fails."""
     cluster = Cluster("a")

@@ -771,15 +771,29 @@ def test_the_plan_does_not_wait_for_an_executor_on_a_lost_host() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
 
 
+def settling(move: Move) -> Plan:
+    """Return a plan that stops the source 3 s after the destination is ready."""
+    stop_there = Stop(move.destination, move.destination_host, 5.0)
+    start = Start(move.destination, move.destination_host, 5.0, undo=stop_there)
+    ready = AwaitReady(move.destination, move.destination_host, 5.0, settle=3.0)
+    stop = Stop(move.source, move.source_host, 5.0)
+    return Plan((start, ready, Commit(), stop), overlap=20.0)
+
+
+def test_a_source_runs_on_if_the_host_of_a_ready_destination_falls_silent() -> None:
+    """The destination may have ended since its report, so the move is undone."""
+    cluster = moving_by(settling)
+    cluster.migrate("p")
+    cluster.wait(1.0)
+    cluster.cut("b", seconds=8.0)
+    assert cluster["p"].owner == 1
+    assert "a" in cluster.where("p")
+    cluster.reconnect("b", seconds=5.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
+
+
 def test_a_new_instance_settles_beside_the_old_one() -> None:
     """Its peers need the overlap to discover the new instance."""
-
-    def settling(move: Move) -> Plan:
-        there = move.destination, move.destination_host, 5.0
-        stop = Stop(move.source, move.source_host, 5.0)
-        ready = AwaitReady(*there, settle=3.0)
-        return Plan((Start(*there), ready, Commit(), stop), overlap=20.0)
-
     cluster = moving_by(settling)
     cluster.migrate("p")
     cluster.wait(2.5)

@@ -286,15 +286,20 @@ def _runs_well(
     elif is_running and process.name not in state.migrations:
         if task.run != run:
             task.run, task.well_since = run, now
-        return _has_lasted(application, task, process, now)
+        return _has_lasted(state, application, task, process, now)
     return False
 
 
-def _has_lasted(application: Application, task: Task, process: Process, now: float) -> bool:
-    version = application.version
+def _has_lasted(
+    state: MasterState, application: Application, task: Task, process: Process, now: float
+) -> bool:  # fmt: skip
+    """Return True if a running process has run for long enough, as its host confirms."""
+    version, owner = application.version, state.owner_of(process)
     lasts = 0.0 if version is None or not application.former else version.rollout.healthy_for
     task.reason = f"must run for {lasts:g} s without a restart"
-    return process.spec.kind is Kind.JOB or now - task.well_since >= lasts
+    if process.spec.kind is Kind.JOB or owner is None:
+        return True
+    return now - task.well_since >= lasts and state.knows_statuses(owner.host)
 
 
 # --- faults and the end -----------------------------------------------------------------------

@@ -291,9 +291,9 @@ def _of_wait(state: MasterState, migration: Migration, step: AwaitReady, now: fl
     if instance is None:
         return _ended(migration, step)
     failed = _ended_before_commit(migration, instance)
-    return failed or done_if(
-        instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
-    )
+    is_ready = instance.state is InstanceState.READY and now >= instance.ready_at + step.settle
+    # Its program may have ended since the last report, and the next step may end its source.
+    return failed or done_if(is_ready and state.knows_statuses(instance.host))
 
 
 def _ended(migration: Migration, step: Start | AwaitReady | SetLifecycle) -> StepFailed:
