@@ -174,7 +174,7 @@ def take_status(state: MasterState, host: Host, status: InstanceStatus, now: flo
         _note_start(state, process, status, now)
     adoption.note_running(state, process, instance)
     _note_restarts(state, process, status, before, pid)
-    if status.state is InstanceState.BACKOFF and failover.is_ready(state, process):
+    if status.state is InstanceState.BACKOFF and failover.can_replace(state, process):
         _requeue_for_standby(state, process)
     if process.wanted is not DesiredState.RUN and not instance.stopping:
         stop_owner(state, process, instance, now)

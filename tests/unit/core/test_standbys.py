@@ -310,6 +310,28 @@ def test_a_primary_that_was_stopped_for_its_standby_has_not_failed_for_the_next_
     assert cluster.phase("p") == "running"
 
 
+def test_a_primary_is_not_given_up_for_a_standby_that_is_lost_too() -> None:
+    """Both run on behind the same cut; the primary is neither killed nor replaced."""
+    cluster = with_standby("b", "c")
+    hosts = ["a", standby_of(cluster)]
+    cluster.cut(*hosts, seconds=60.0)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("unreachable", 1)
+    for host in hosts:
+        cluster.rejoin(host, seconds=10.0)
+    assert (cluster.phase("p"), cluster.active(), cluster["p"].owner) == ("running", ["a"], 1)
+
+
+def test_a_primary_in_back_off_is_not_stopped_for_a_standby_on_a_silent_host() -> None:
+    """The supervisor restarts the primary, because the standby may have ended."""
+    cluster = with_standby(restart=RestartPolicy("on-failure"))
+    cluster.cut("b", seconds=3.0)
+    machine = cluster.machines["a"]
+    status = machine.slave.held[machine.find("p")].status
+    machine._supervisor_says(replace(status, state=InstanceState.BACKOFF, pid=0), cluster.now)
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster.where("p")) == ("backoff", ["a", "b"])
+
+
 def test_a_restart_by_request_causes_no_take_over() -> None:
     """The primary restarts on its host without a failover."""
     cluster = with_standby()

@@ -106,7 +106,7 @@ def _is_given_up(state: MasterState, instance: Instance, now: float) -> bool:
         return False
     if process.owner not in (0, instance.id.number) and not _may_be_active(state, instance):
         return True
-    if process.owner == instance.id.number and failover.is_ready(state, process):
+    if process.owner == instance.id.number and failover.can_replace(state, process):
         return True
     policy = instance.spec.host_loss
     lost_for = now - instance.host.lost_since

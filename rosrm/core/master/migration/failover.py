@@ -34,6 +34,17 @@ def is_ready(state: MasterState, process: Process) -> bool:
     return reports is not None and ReportPhase.READY in reports.phases
 
 
+def can_replace(state: MasterState, process: Process) -> bool:
+    """Return True if a standby is ready on a host that reports, so that its primary may be ended.
+
+    Behind the same cut of the network as its primary, or after an unreported end, it is no
+    replacement.
+    """
+    standby = state.standbys.get(process.name)
+    reports = standby is not None and state.knows_statuses(standby.destination_host)
+    return reports and is_ready(state, process)
+
+
 def _has_state(state: MasterState, process: Process, end: End) -> bool:
     """Return True if a process that has ended has a standby with its state, ready or not.
 
