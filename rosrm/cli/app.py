@@ -22,6 +22,8 @@ from rosrm.wording import reason_of
 #: New objects after which Python looks for cycles: more than the imports of a command create, for
 #: which the default of 700 costs 10 % of a command's CPU time.
 _COLLECT_AFTER: Final = 100_000
+#: Modules after whose import threads of others may run.
+_KEEP_THREADS: Final = ("rclpy", "rosrm.extensions.registry")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -32,7 +34,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _run(sys.argv[1:] if arguments is None else arguments)
     except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        _leave(INTERRUPTED)
+    except Exception:  # noqa: BLE001 - reported as Python does, which would then wait for threads
+        sys.excepthook(*sys.exc_info())
+        _leave(1)
 
 
 def _leave_removed_directory() -> None:
@@ -70,7 +75,6 @@ def _run(arguments: Sequence[str]) -> None:
     except SystemExit as ended:
         early.drop()
         _leave(ended.code)
-        raise
     except OSError as error:
         if error.errno not in NO_ROOM:
             raise
@@ -92,18 +96,23 @@ def _run_without_parser(command: Callable[[], None]) -> NoReturn:
     sys.exit(0)
 
 
-def _leave(code: object) -> None:
+def _leave(code: object) -> NoReturn:
     """Exit with a code, or with 1 if the rest of the output cannot be written.
 
-    If ROS was used, skip the normal exit, in which Fast DDS sleeps 0.1 s.
+    If ROS or plugins were used, skip the normal exit: in it Fast DDS sleeps 0.1 s, and Python waits
+    for threads that a plugin has left.
     """
-    if not (code is None or isinstance(code, int)):
-        return
-    status = code or 0
+    if code is None or isinstance(code, int):
+        status = code or 0
+    else:
+        _say(str(code))
+        status = 1
     for stream in (sys.stdout, sys.stderr):
         status = status if _flush(stream, status) else status or 1
-    if "rclpy" in sys.modules:
-        os._exit(status)
+    if not sys.modules.keys().isdisjoint(_KEEP_THREADS):
+        from rosrm.runtime.process_end import end_now  # noqa: PLC0415 - see above
+
+        end_now(status)
     sys.exit(status)
 
 

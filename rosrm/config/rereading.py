@@ -10,6 +10,7 @@ from rosrm.config.cluster import load_cluster
 from rosrm.config.host import load_host
 from rosrm.errors import RosrmError
 from rosrm.extensions.registry import Registry
+from rosrm.runtime.process_end import end_now
 
 
 def main(role: str, path: str, domain: str) -> int:
@@ -37,4 +38,4 @@ def main(role: str, path: str, domain: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(*sys.argv[1:]))
+    end_now(main(*sys.argv[1:]))

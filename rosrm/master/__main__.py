@@ -19,8 +19,9 @@ from rosrm.config.settings import ClusterConfig
 from rosrm.ros.own_signals import own_signals
 from rosrm.ros.participant import Participant
 from rosrm.ros.peer_announcements import request_announcements
-from rosrm.runtime.bootstrap import Handover, end_process, run
+from rosrm.runtime.bootstrap import Handover, run
 from rosrm.runtime.crash_notes import kept_notes
+from rosrm.runtime.process_end import end_process
 
 
 def serve(handover: Handover) -> int:

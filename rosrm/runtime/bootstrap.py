@@ -12,12 +12,11 @@ import logging
 import os
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Final, NoReturn
+from typing import Final
 
 from rosrm.errors import ConfigError, RosrmError
 from rosrm.extensions.installed import PluginAddress, installed_plugins
@@ -28,8 +27,6 @@ from rosrm.runtime.settings_check import SettingsSource
 from rosrm.wording import printable
 
 _OPTION: Final = "--settings-fd"
-#: Seconds for the ends of threads and workers of plugins, after the part itself has ended.
-_LAST_SECONDS: Final = 3.0
 #: Thresholds of the garbage collector of a runtime.
 _COLLECT_AT: Final = (10_000, 20, 20)
 
@@ -149,29 +146,6 @@ def end_start() -> None:
     gc.freeze()
     gc.set_threshold(*_COLLECT_AT)
     gc.enable()
-
-
-def end_process(code: int) -> NoReturn:
-    """End this process with an exit code, also if a plugin has left threads that do not end.
-
-    Python waits for threads and workers, so that they may finish; they get a few seconds.
-    """
-    timer = threading.Timer(_LAST_SECONDS, _end_now, [code])
-    timer.daemon = True
-    timer.start()
-    sys.exit(code)
-
-
-def _end_now(code: int) -> None:
-    """End the workers that a plugin has left, and this process."""
-    workers = getattr(sys.modules.get("multiprocessing.process"), "_children", ())
-    for worker in list(workers):
-        with contextlib.suppress(Exception):
-            worker.kill()
-    with contextlib.suppress(Exception):
-        sys.stderr.flush()
-        sys.stdout.flush()
-    os._exit(code)
 
 
 class LogFormatter(logging.Formatter):

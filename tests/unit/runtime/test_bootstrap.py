@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
-
-import pytest
 
 from rosrm.runtime.bootstrap import LogFormatter
 
@@ -34,24 +30,3 @@ def test_a_traceback_keeps_its_lines():
         line = formatted("failed", exc_info=(type(fault), fault, fault.__traceback__))
     assert line.splitlines()[1] == "Traceback (most recent call last):"
     assert r"\x1b[2J" in line.splitlines()[-1]
-
-
-LEFT_BEHIND = {
-    "a thread": "threading.Thread(target=time.sleep, args=(1000,)).start()",
-    "a pool": "concurrent.futures.ThreadPoolExecutor(1).submit(time.sleep, 1000)",
-    "a worker": (
-        "multiprocessing.get_context('fork').Process(target=time.sleep, args=(1000,)).start()"
-    ),
-    "a handler at exit": "atexit.register(time.sleep, 1000)",
-}
-
-
-@pytest.mark.parametrize("left", LEFT_BEHIND.values(), ids=LEFT_BEHIND)
-def test_a_part_ends_although_a_plugin_has_left_something(left: str) -> None:
-    """The process ends with its exit code within seconds, and leaves no worker behind."""
-    program = (
-        "import atexit, concurrent.futures, multiprocessing, threading, time\n"
-        f"from rosrm.runtime.bootstrap import end_process\n{left}\nend_process(7)"
-    )
-    process = subprocess.run([sys.executable, "-c", program], timeout=60.0, check=False)
-    assert process.returncode == 7

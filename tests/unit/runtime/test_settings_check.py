@@ -83,6 +83,17 @@ def test_what_a_plugin_prints_is_no_part_of_the_settings(tmp_path: Path, importe
     assert (config.host, fault) == ("h", "")
 
 
+def test_a_thread_that_a_plugin_leaves_does_not_lengthen_the_check(
+    tmp_path: Path, imported
+) -> None:
+    """The check ends, and the reload is not refused."""
+    imported("import threading, time\nthreading.Thread(target=time.sleep, args=(1000,)).start()\n")
+    path = tmp_path / "host.yaml"
+    path.write_text("host: h\n")
+    config, fault = outcome(SettingsSource("slave", str(path)))
+    assert (config and config.host, fault) == ("h", "")
+
+
 #: Lets a check print what a later version of rosrm might.
 _LATER = """
 from rosrm.config.settings import ClusterConfig, HostConfig

@@ -1,0 +1,51 @@
+"""Ends of processes in which a plugin has left what never ends."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+LEFT_BEHIND = {
+    "a thread": "threading.Thread(target=time.sleep, args=(1000,)).start()",
+    "a pool": "concurrent.futures.ThreadPoolExecutor(1).submit(time.sleep, 1000)",
+    "a worker": (
+        "multiprocessing.get_context('fork').Process(target=time.sleep, args=(1000,)).start()"
+    ),
+    "a handler at exit": "atexit.register(time.sleep, 1000)",
+}
+
+
+@pytest.mark.parametrize("left", LEFT_BEHIND.values(), ids=LEFT_BEHIND)
+def test_a_part_ends_although_a_plugin_has_left_something(left: str) -> None:
+    """The process ends with its exit code within seconds, and leaves no worker behind."""
+    program = (
+        "import atexit, concurrent.futures, multiprocessing, threading, time\n"
+        f"from rosrm.runtime.process_end import end_process\n{left}\nend_process(7)"
+    )
+    process = subprocess.run([sys.executable, "-c", program], timeout=60.0, check=False)
+    assert process.returncode == 7
+
+
+#: Commands that import the plugins, and their exit codes.
+COMMANDS = {"plugins --local": 0, "config check work.yaml": 0, "master --config invalid.yaml": 2}
+
+
+@pytest.mark.parametrize(("words", "code"), COMMANDS.items())
+def test_a_command_ends_although_a_plugin_has_left_a_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, code: int
+) -> None:
+    """Otherwise a service manager would take a master with invalid settings for one that runs."""
+    folder = tmp_path / "guest-1.dist-info"
+    folder.mkdir()
+    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: guest\nVersion: 1\n")
+    (folder / "entry_points.txt").write_text("[rosrm]\nguest = guest\n")
+    (tmp_path / "guest.py").write_text(f"import threading, time\n{LEFT_BEHIND['a thread']}\n")
+    (tmp_path / "work.yaml").write_text("processes: [{name: p, command: sleep 1}]\n")
+    (tmp_path / "invalid.yaml").write_text("scoring: {policy: nosuch}\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    command = [sys.executable, "-m", "rosrm.cli", *words.split()]
+    ended = subprocess.run(command, cwd=tmp_path, timeout=60.0, check=False)
+    assert ended.returncode == code
