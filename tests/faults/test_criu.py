@@ -90,21 +90,25 @@ class Scene:
             cluster.start_master()
             return
         if victim in ("source", "destination"):
-            os.kill(self._pid_of(victim), signal.SIGKILL)
+            if pid := self._pid_of(victim):
+                os.kill(pid, signal.SIGKILL)
             return
         name = self.source if victim == "source's slave" else _OTHER[self.source]
         cluster.slaves[name].process.kill()
         cluster.slaves[name].process.wait(PATIENCE)
         cluster.start_slave(next(one for one in cluster.hosts if one.host == name))
 
-    def _pid_of(self, victim: str) -> int:
-        """Return the pid of the source, or of the destination once it was started."""
+    def _pid_of(self, victim: str) -> int | None:
+        """Return the pid of the source, or of the destination once it was started.
+
+        None: the migration has killed the source.
+        """
         deadline = time.monotonic() + PATIENCE
         while True:
             found = instances(self.cluster, NAME)
             number = self._number if victim == "source" else max(found)
             if victim == "source" or number != self._number:
-                return found[number]
+                return found.get(number)
             assert time.monotonic() < deadline, f"no {victim}: {found}"
 
     def end(self, *, but: str = "?") -> str:
