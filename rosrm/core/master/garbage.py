@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from rosrm.core.master.dependants import binding_dependants
 from rosrm.core.master.master_state import MasterState, process_key, version_key
 from rosrm.core.master.state.applications import Application
 from rosrm.core.master.state.intents import version_intent
 from rosrm.core.master.state.process import Process, ProcessPhase
 from rosrm.model.records import Intent
-
-#: Number of removed processes whose replicas are dropped when a host returns with one.
-_MOST_REMOVED: Final = 10_000
 
 
 def collect_garbage(state: MasterState) -> None:
@@ -66,11 +61,7 @@ def remove_process(state: MasterState, name: str) -> None:
 
 def _note_removed(state: MasterState, name: str) -> None:
     """Journal the removal of a stateful process, because a host may return with a replica."""
-    removed = state.replication.removed
-    removed.pop(name, None)  # oldest first
-    removed[name] = state.next_instance
+    oldest = state.replication.removed.put(name, state.next_instance)
     state.emit(Intent("removed", name, {"next": state.next_instance}))
-    if len(removed) > _MOST_REMOVED:
-        oldest = next(iter(removed))
-        del removed[oldest]
+    if oldest is not None:
         state.emit(Intent("removed", oldest, None))

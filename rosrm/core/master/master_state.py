@@ -25,7 +25,7 @@ from rosrm.core.master.state.hosts import Host, HostCondition, HostTable
 from rosrm.core.master.state.images import Images
 from rosrm.core.master.state.intents import Unsaved, mode_intent, modes_intent, version_intent
 from rosrm.core.master.state.journal_gap import JournalGap
-from rosrm.core.master.state.learned_needs import Estimate, LearnedNeeds
+from rosrm.core.master.state.learned_needs import MOST_PROGRAMS, Estimate, LearnedNeeds
 from rosrm.core.master.state.link_queries import LinkQueries
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.modes import Modes
@@ -46,6 +46,7 @@ from rosrm.core.master.state.queue import Queue
 from rosrm.core.master.state.reloads import Reloads
 from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.core.master.state.start_orders import StartOrders
+from rosrm.core.newest import Newest
 from rosrm.extensions.contracts import MigrationStrategy
 from rosrm.extensions.declared_fields import Declared
 from rosrm.extensions.placement import ChainOf, PlacementPlugins, PolicySettings
@@ -157,7 +158,7 @@ class MasterState:
         self.standbys: dict[str, Migration] = {}
         self.wants_standby: dict[str, None] = {}
         self.learned = LearnedNeeds()
-        self.run_times: dict[str, float] = {}
+        self.run_times = Newest[str, float](MOST_PROGRAMS)
         self.gangs = Gangs()
         self.neighbours = NeighbourRules()
         self.start_orders = StartOrders()

@@ -27,8 +27,6 @@ from rosrm.model.values import (
 
 #: Seconds for which an end is remembered for a master that may not have received its report.
 REMEMBER_END: Final = 60.0
-#: Highest number of tombstones.
-_TOMBSTONES: Final = 10_000
 
 #: Seconds after which a wait is reported, because most waits for other starts are shorter, and a
 #: report of one costs the master as much as that of a start. Far below `delivery_timeout`;
@@ -236,9 +234,7 @@ def _end_ordered(
 
 
 def _bury(state: SlaveState, instance: InstanceId) -> None:
-    state.tombstones[instance] = None
-    while len(state.tombstones) > _TOMBSTONES:
-        del state.tombstones[next(iter(state.tombstones))]
+    state.tombstones.put(instance, None)
 
 
 def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float) -> _Commands:

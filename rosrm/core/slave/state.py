@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
+from typing import Final
 
+from rosrm.core.newest import Newest
 from rosrm.core.slave.health import InstanceHealth
 from rosrm.core.slave.watches import (
     Awaited,
@@ -27,6 +29,10 @@ from rosrm.model.values import (
     LifecycleGoal,
     ProcessSpec,
 )
+
+#: Ended and refused instances of which a late order to start is refused: those of some seconds, at
+#: the highest rate of jobs.
+_MOST_TOMBSTONES: Final = 2_000
 
 
 @dataclass(slots=True)
@@ -170,7 +176,7 @@ class SlaveState:
     waiting: dict[InstanceId, Assignment] = field(default_factory=dict)
     unreported: dict[InstanceId, float] = field(default_factory=dict)
     holds_starts: bool = False
-    tombstones: dict[InstanceId, None] = field(default_factory=dict)
+    tombstones: Newest[InstanceId, None] = field(default_factory=lambda: Newest(_MOST_TOMBSTONES))
 
     def hold(self, instance: InstanceId, held: HeldInstance) -> HeldInstance:
         """Add an instance, or note that its status is another one."""

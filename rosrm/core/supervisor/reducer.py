@@ -79,6 +79,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Final
 
+from rosrm.core.newest import Newest
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.commands import Command, Drop, Leave, ReportStatus, Spawn
 from rosrm.core.supervisor.instance import (
@@ -119,7 +120,7 @@ class SupervisorState:
 
     def __init__(self) -> None:
         self.instances: dict[Key, Instance] = {}
-        self.dead: dict[str, int] = {}
+        self.dead = Newest[str, int](MOST_TOMBSTONES)
         self.closing = False
         self._timed: dict[Key, float] = {}
         self._active: dict[Key, Instance] = {}  # neither held nor ended
@@ -273,10 +274,7 @@ class SupervisorState:
     def _bury(self, instance: Instance) -> Drop:
         name, number = instance.key
         del self.instances[instance.key]
-        newest = max(number, self.dead.pop(name, number))
-        self.dead[name] = newest
-        while len(self.dead) > MOST_TOMBSTONES:
-            del self.dead[next(iter(self.dead))]
+        self.dead.put(name, max(number, self.dead.get(name, number)))
         return Drop(instance.key)
 
     def _nothing_to_wait_for(self) -> bool:

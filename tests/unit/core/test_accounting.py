@@ -7,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rosrm.core.master import master_state
 from rosrm.core.master.events import UsagesReceived
+from rosrm.core.master.state import learned_needs
 from rosrm.model.values import Accounting, ResourceDescription, RestartPolicy
 from tests.unit.core.cluster import GIB, Cluster, Machine, job, movable, process
 
@@ -93,6 +95,22 @@ def test_the_measured_peak_of_an_attributed_resource_is_learned() -> None:
     cluster.finish("p")
     cluster.submit(process("q"))
     assert cluster.explain("q")["decision"]["need"]["gpu_memory"] == 4.0
+
+
+def test_only_the_programs_run_last_are_remembered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each job of a sweep over parameters is a program; the master does not grow with them."""
+    monkeypatch.setattr(master_state, "MOST_PROGRAMS", 3)
+    monkeypatch.setattr(learned_needs, "MOST_PROGRAMS", 3)
+    gpu = host("a", "gpu_memory", "attributed")
+    cluster = Cluster(gpu, settle=SETTLE)
+    for run, seed in enumerate([0, 1, 2, 3, 1, 4]):
+        cluster.submit(job(f"p{run}", command=("run", f"--seed={seed}")))
+        gpu.shown[f"p{run}"] = {"gpu_memory": 1.0 + run}
+        cluster.wait(1.0)
+        cluster.finish(f"p{run}")
+    kept = {"run --seed=1", "run --seed=3", "run --seed=4"}
+    assert set(cluster.intents["learned"]) == kept
+    assert set(cluster.state.run_times) == kept
 
 
 # --- eviction ---------------------------------------------------------------------------------

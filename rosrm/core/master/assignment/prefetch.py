@@ -30,7 +30,7 @@ def learn_run_time(state: MasterState, spec: ProcessSpec, status: InstanceStatus
     is_job = spec.kind is Kind.JOB and status.state is InstanceState.EXITED
     if is_job and 0.0 < status.run_time <= LONGEST:
         before = state.run_times.get(spec.program, status.run_time)
-        state.run_times[spec.program] = before + _NEWEST * (status.run_time - before)
+        state.run_times.put(spec.program, before + _NEWEST * (status.run_time - before))
 
 
 def review_slots(state: MasterState, host: Host, now: float) -> None:

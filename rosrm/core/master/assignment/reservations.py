@@ -49,9 +49,9 @@ def learn_from(state: MasterState, instance: Instance, status: InstanceStatus) -
     }
     plausible = {name: used for name, used in peaks.items() if is_plausible(name, used)}
     may_lower = is_telling and not _has_failed(status)
-    counts = state.learned.learn(instance.spec.program, plausible, may_lower=may_lower)
-    if counts is not None:
-        state.emit(Intent("learned", instance.spec.program, counts))
+    changed = state.learned.learn(instance.spec.program, plausible, may_lower=may_lower)
+    for program, counts in changed.items():
+        state.emit(Intent("learned", program, counts and dict(counts)))
 
 
 def _has_failed(status: InstanceStatus) -> bool:

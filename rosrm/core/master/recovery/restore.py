@@ -59,7 +59,8 @@ def restore(state: MasterState, intents: Callable[[str], _Table], now: float) ->
     for program, amounts in intents("learned").items():
         state.learned.restore(program, amounts)
     removed = ((int(one["next"]), name) for name, one in intents("removed").items())
-    state.replication.removed.update((name, end) for end, name in sorted(removed))
+    for end, name in sorted(removed):
+        state.replication.removed.put(name, end)
     _restore_applications(state, intents)
     stored = sorted(intents("process").values(), key=lambda item: int(item["order"]))
     moves = intents("migration")

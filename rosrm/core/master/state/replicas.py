@@ -14,12 +14,15 @@ from typing import Final
 from rosrm.core.master.commands import OrderId
 from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import HostCondition, HostTable
+from rosrm.core.newest import Newest
 from rosrm.extensions.contracts import CheckpointChoice, CheckpointPolicy
 from rosrm.model.description_checks import name_fault
 from rosrm.model.values import EMPTY, SnapshotReport
 
 #: Maximum number of snapshots of one host that count.
 _MOST_OF_HOST: Final = 10_000
+#: Removed processes whose replicas are dropped when a host returns with one.
+_MOST_REMOVED: Final = 10_000
 _IN_REACH: Final = frozenset({HostCondition.UP, HostCondition.SUSPECT})
 
 
@@ -134,7 +137,7 @@ class ReplicationState:
     replicas: ReplicaIndex = field(default_factory=ReplicaIndex)
     last_orders: dict[str, ReplicationOrder] = field(default_factory=dict)
     drops: dict[tuple[str, str, int], Backoff] = field(default_factory=dict)
-    removed: dict[str, int] = field(default_factory=dict)
+    removed: Newest[str, int] = field(default_factory=lambda: Newest(_MOST_REMOVED))
     waiting: list[str] = field(default_factory=list)
     reviewed_at: float = -inf
 
