@@ -13,6 +13,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.modes.switching import mode_rows
 from rosrm.core.master.state.hosts import Host
 from rosrm.journal.sqlite import SqliteJournal
+from rosrm.master.answer_size import short_applications, short_events, short_processes
 from rosrm.master.disclosure import disclosed
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.records import StoredRecord
@@ -64,10 +65,12 @@ class MasterQueries:
             last_sequence=self._journal.last_sequence,
             trouble=self._trouble(),
             hosts=listing.host_rows(state, now) if request.hosts else (),
-            processes=self._processes(request.process, now, by) if request.processes else (),
+            processes=short_processes(self._processes(request.process, now, by))
+            if request.processes
+            else (),
             plugins=self._plugin_rows(request) if request.plugins else (),
-            events=self._events(request, by) if request.events else (),
-            applications=self._applications(by) if request.applications else (),
+            events=short_events(self._events(request, by)) if request.events else (),
+            applications=short_applications(self._applications(by)) if request.applications else (),
             modes=mode_rows(state) if request.modes else (),
         )
 
