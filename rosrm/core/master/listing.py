@@ -15,6 +15,7 @@ from rosrm.core.master.checkpoint.images import reason_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import hosts_to_move_to
 from rosrm.core.master.process_defaults import defaulted_values
+from rosrm.core.master.rights import may_affect
 from rosrm.core.master.schedules import why_scheduled
 from rosrm.core.master.scheduling.decision import Decision, DecisionKind
 from rosrm.core.master.state.devices import Inventory
@@ -137,10 +138,21 @@ def _reason_of_phase(state: MasterState, process: Process) -> str:
 
 def _who_is_first(state: MasterState, process: Process) -> str:
     """Return a phrase on the head of the queue, which a process behind it waits for; "": none."""
-    first = state.queue.head()
-    if process.phase is not ProcessPhase.QUEUED or state.settings.backfill or first is None:
+    if process.phase is not ProcessPhase.QUEUED or state.settings.backfill:
         return ""
+    first = _first_before(state, process)
     return "" if first == process.name else f"waits behind {first}"
+
+
+def _first_before(state: MasterState, process: Process) -> str:
+    """Return the first process in the queue that may hold back another one that waits in it."""
+    head = state.queue.head()
+    if head is not None and may_affect(state.processes[head], process):
+        return head
+    for name in state.queue:
+        if name not in state.queue.awaiting and may_affect(state.processes[name], process):
+            return name
+    return process.name
 
 
 def _limit(process: Process, owner: Instance | None, name: str) -> float:
@@ -290,13 +302,14 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return awaited
     made = state.preemption.room_made.get(process.name) if position else None
     room = made.reason if made is not None else ""
-    if position <= 1 or room or state.queue.head() == process.name:
+    first = _first_before(state, process) if position > 1 else process.name
+    if first == process.name or room:
         owner = state.owner_of(process)
         reason = _reason_of_phase(state, process) or _missing_standby(state, process)
         reason = reason or _awaited_node(process, owner)
         return f"{reason}; {room}" if room and room != reason else reason
-    ahead = f"{position - 1} before it in the queue, {state.queue.head()} first"
-    return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so all wait for it"
+    ahead = f"{position - 1} before it in the queue, {first} first"
+    return ahead if state.settings.backfill else f"{ahead}; `backfill` is off, so it waits for that"
 
 
 def _advice(state: MasterState, process: Process) -> str:

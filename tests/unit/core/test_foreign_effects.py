@@ -176,3 +176,32 @@ def test_no_spec_changes_where_a_process_of_another_user_may_run(naming: str) ->
 
     at_a = {"rack": "a"} if naming.startswith("near") else {}  # where `own` starts
     assert judged(NAMING[naming]()) == judged(movable("m", required_labels=at_a))
+
+
+@pytest.mark.parametrize("priority", [0, 99])
+def test_a_process_that_waits_for_room_holds_back_none_of_another_user(priority: int) -> None:
+    """It may wait for ever, for room beside what always runs there; its owner's wait with it."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB))
+    submit(cluster, ALICE, process("own", memory=300))
+    cluster.wait(3.0)
+    submit(cluster, MALLORY, process("large", memory=700, priority=priority))
+    submit(cluster, MALLORY, process("later", memory=50))
+    submit(cluster, ALICE, process("small", memory=50), process("first", memory=600))
+    submit(cluster, ALICE, process("second", memory=50))
+    cluster.wait(3.0)
+    assert cluster.where("small") == ["a"]
+    assert [cluster.phase(name) for name in ("large", "later", "second")] == ["queued"] * 3
+    assert "large first" in cluster.explain("later")["reason"]
+    assert "first first" in cluster.explain("second")["reason"]
+
+
+def test_a_process_of_an_operator_holds_back_those_of_all() -> None:
+    """Strict first in, first out: it gets its room before later ones take it."""
+    cluster = Cluster(Machine("a", memory=1000 * MIB))
+    submit(cluster, ALICE, process("own", memory=300))
+    cluster.wait(3.0)
+    submit(cluster, ROOT, process("large", memory=700))
+    submit(cluster, ALICE, process("small", memory=50))
+    cluster.wait(3.0)
+    assert cluster.phase("small") == "queued"
+    assert "large first" in cluster.explain("small")["reason"]

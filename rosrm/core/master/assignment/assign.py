@@ -148,7 +148,10 @@ def decide_now(state: MasterState, process: Process) -> Decision:
 
 
 def place_waiting(state: MasterState, now: float) -> None:
-    """Assign queued processes until the head fits nowhere (`backfill`: until no process fits)."""
+    """Assign queued processes until the head fits nowhere (`backfill`: until no process fits).
+
+    A head that its owner may not place before those of others holds back its owner's alone.
+    """
     if not len(state.queue) or state.placed_at == _versions(state):
         return
     head = state.queue.head()
@@ -254,8 +257,27 @@ def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
 
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
     for name in _in_line(state, passed_over):
-        if not _place_or_set_aside(state, state.processes[name], now):
+        process = state.processes[name]
+        if not _place_or_set_aside(state, process, now):
+            _place_past(state, process, passed_over, now)
             return
+
+
+def _place_past(
+    state: MasterState, blocking: Process, passed_over: frozenset[str], now: float
+) -> None:
+    """Place processes behind one that waits for room, of owners whom it may not hold back."""
+    owners = {blocking.principal}
+    if blocking.by_operator:
+        return
+    for name in state.queue:
+        if name in passed_over or name not in state.queue:
+            continue
+        process = state.processes[name]
+        if process.principal not in owners and not _place_or_set_aside(state, process, now):
+            if process.by_operator:
+                return
+            owners.add(process.principal)
 
 
 def _in_line(state: MasterState, passed_over: frozenset[str]) -> Iterator[str]:
