@@ -17,6 +17,7 @@ from typing import Final, NoReturn, TextIO
 
 from rosrm.cli.process import INTERRUPTED
 from rosrm.runtime.atomic_file import NO_ROOM
+from rosrm.runtime.process_end import end_now, flushed
 from rosrm.wording import reason_of
 
 #: New objects after which Python looks for cycles: more than the imports of a command create, for
@@ -110,22 +111,16 @@ def _leave(code: object) -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         status = status if _flush(stream, status) else status or 1
     if not sys.modules.keys().isdisjoint(_KEEP_THREADS):
-        from rosrm.runtime.process_end import end_now  # noqa: PLC0415 - see above
-
         end_now(status)
     sys.exit(status)
 
 
 def _flush(stream: TextIO, status: int) -> bool:
     """Flush a standard stream; return False if it cannot be written."""
-    try:
-        stream.flush()
-    except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())  # else Python flushes again
-        if error.errno != errno.EPIPE and status == 0:
-            _say(f"rosrm: the output cannot be written: {reason_of(error)}")
-        return False
-    return True
+    error = flushed(stream)
+    if error is not None and error.errno != errno.EPIPE and status == 0:
+        _say(f"rosrm: the output cannot be written: {reason_of(error)}")
+    return error is None
 
 
 def _say(text: str) -> None:

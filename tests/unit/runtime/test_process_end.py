@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,24 @@ def test_a_part_ends_although_a_plugin_has_left_something(left: str) -> None:
         f"from rosrm.runtime.process_end import end_process\n{left}\nend_process(7)"
     )
     process = subprocess.run([sys.executable, "-c", program], timeout=60.0, check=False)
+    assert process.returncode == 7
+
+
+def test_a_part_whose_terminal_was_closed_ends_with_its_code() -> None:
+    """What it has written last cannot be written any more."""
+    terminal, its_end = os.openpty()
+    program = (
+        "import sys; from rosrm.runtime.process_end import end_process\n"
+        "print('ready'); sys.stdin.read(); sys.stdout.write('last words'); end_process(7)"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=its_end, stderr=its_end,
+        env={**os.environ, "PYTHONUNBUFFERED": ""},
+    )  # fmt: skip
+    os.close(its_end)
+    assert b"ready" in os.read(terminal, 100)
+    os.close(terminal)
+    process.communicate(b"go on\n", timeout=60.0)
     assert process.returncode == 7
 
 
