@@ -11,8 +11,8 @@ Sen), by which one sample during an activity changes little.
   page that N processes share as 1/N for each.
 - `file_bytes_a_job`: of the state directory of each part, and of the master's journal.
 
-The master keeps `--keep-ended` ended processes and ten times as many events on purpose, so the
-warm-up should be longer than that.
+The master keeps `--keep-ended` ended processes and ten times as many events on purpose, a slave and
+a supervisor the names of 2,000 ended processes. The warm-up should be longer than all of them.
 """
 
 from __future__ import annotations
@@ -258,6 +258,8 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
                 steady.add(soak.jobs, soak.parts(), soak.directory)
             if number % 10 == 9:
                 say(f"benchmarks.soak: {soak.jobs} jobs, {soak.moves} moves")
+        if arguments.restarts:
+            say(f"benchmarks.soak: {steady.growth([*soak.parts()])}")
         for number in range(arguments.restarts):
             soak.restart(number)
             soak.batch()
@@ -284,11 +286,11 @@ def options() -> argparse.ArgumentParser:
     """Return the parser of the command line."""
     command_line = parser(__doc__)
     for name, default, what in (
-        ("--jobs", 20_000, "jobs without a restart of a part"),
+        ("--jobs", 30_000, "jobs without a restart of a part"),
         ("--moves", 500, "moves of a process between two hosts"),
         ("--applies", 200, "versions of an application"),
         ("--restarts", 50, "restarts of the master and the slaves, with 100 jobs after each"),
-        ("--warm-up", 5_000, "jobs before the first sample"),
+        ("--warm-up", 10_000, "jobs before the first sample"),
         ("--keep-ended", 2_000, "ended processes that the master keeps"),
     ):
         command_line.add_argument(name, type=int, default=default, help=what)
