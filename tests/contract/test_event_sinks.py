@@ -1,6 +1,7 @@
 """Every shipped event sink holds the contract that a third party's holds."""
 
 import json
+from contextlib import closing
 
 import pytest
 from mcap.reader import make_reader
@@ -63,6 +64,11 @@ class TestMcapFile(EventSinkContract):
             ("foxglove.Log", "/rosrm/events")
         }
         return [json.loads(message.data)["id"] for _, _, message in messages]
+
+    def test_no_other_user_may_read_the_file(self):
+        """Its events name the processes of all users."""
+        with closing(self.make()):
+            assert self.file.stat().st_mode & 0o777 == 0o600
 
 
 def test_each_shipped_sink_is_here():

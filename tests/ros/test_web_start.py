@@ -166,6 +166,18 @@ def test_a_signal_ends_the_gateway_while_a_reader_follows(ros, number):
         assert one.end(number) == 0
 
 
+def test_a_signal_that_the_starter_ignores_does_not_end_the_gateway(ros):
+    """As SIGINT where a script without job control starts it with `&`."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with gateway(ros) as one:
+            one.process.send_signal(signal.SIGINT)
+            assert one.get("/v1/status")
+            assert one.end(signal.SIGTERM) == 0
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 @pytest.fixture
 def certificate(tmp_path):
     """Return the files of a certificate for 127.0.0.1 and of its key."""

@@ -9,8 +9,8 @@ import math
 import resource
 import signal
 import socket
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, cast
 
@@ -18,6 +18,7 @@ import uvicorn
 
 from rosrm import clocks
 from rosrm.errors import ConfigError, NoMaster, Refused
+from rosrm.runtime.dispositions import handle
 from rosrm.wording import reason_of
 from rosrm_web.access import Access
 from rosrm_web.app import create_app
@@ -141,10 +142,18 @@ class AcceptErrors:
         self._logged, self._more = now, 0
 
 
+class _Server(uvicorn.Server):
+    """A server that ends by `_serve` alone: its own handlers take signals that it has to ignore."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
 def http_server(app: App, settings: Settings) -> uvicorn.Server:
     """Return a server for an application."""
     protocol = partial(Connection, tls=settings.tls())
-    return uvicorn.Server(uvicorn.Config(
+    return _Server(uvicorn.Config(
         app, loop="asyncio", http=cast("type[asyncio.Protocol]", protocol), lifespan="on",
         log_config=None, access_log=False, server_header=False, proxy_headers=False,
         h11_max_incomplete_event_size=_LARGEST_HEAD, timeout_graceful_shutdown=1,
@@ -160,18 +169,16 @@ async def _serve(
     loop = asyncio.get_running_loop()
     loop.set_exception_handler(AcceptErrors())
 
-    def stop() -> None:
+    def stop(*_: object) -> None:
         server.should_exit = True
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop)
+    handle((signal.SIGINT, signal.SIGTERM), stop)
     with suppress(NoMaster, Refused):  # all other errors will not pass
         await gateway.watcher.look()
     tasks = [
         serve_always(gateway.watcher.run, "watcher"), serve_always(access.follow_file, "tokens"),
     ]  # fmt: skip
     ready()
-    # uvicorn raises the signal again at its end: `stop` takes it.
     await server.serve(sockets=[listener])
     for task in tasks:
         task.cancel()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -65,7 +66,8 @@ class McapFile:
         start = now.strftime("%Y%m%dT%H%M%SZ")
         path = Path(options.file.replace("{time}", start)).expanduser()
         try:
-            self._stream = path.open("xb")
+            new = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+            self._stream = os.fdopen(os.open(path, new, 0o600), "wb")  # events have no other reader
         except FileExistsError:
             raise ConfigError(
                 f"{path} exists and is not overwritten; with `{{time}}` in the name each run has "
