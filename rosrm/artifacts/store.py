@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import os
 from collections.abc import Callable
 from collections.abc import Set as AbstractSet
@@ -18,6 +17,7 @@ from rosrm.model.artifacts import LARGEST_ARTIFACT, is_digest
 from rosrm.model.ledger import Store, bound_of
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
+from rosrm.shortage import SHORTAGE
 from rosrm.wording import reason_of
 from rosrm.wording import size as sized
 
@@ -29,8 +29,6 @@ _IDLE: Final = 60.0
 #: Most uploads at a time.
 _MOST_UPLOADS: Final = 16
 _PART: Final = ".part"
-#: Errors of a machine without room for another open file, which pass.
-_NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 @dataclass(slots=True)
@@ -135,7 +133,7 @@ class ArtifactStore:
                 file.seek(offset)
                 return size, file.read(max(0, min(most, size - offset)))
         except OSError as error:
-            if error.errno in _NO_ROOM:
+            if error.errno in SHORTAGE:
                 why = f"the master cannot read an artifact now: {reason_of(error)}"
                 raise Refused(why, "busy") from None
             self._sizes.pop(digest, None)

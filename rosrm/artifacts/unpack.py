@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Final
 
 from rosrm.errors import TransferError
 from rosrm.model.artifacts import name_fault
+from rosrm.shortage import raise_shortage
 
 if TYPE_CHECKING:
     from tarfile import TarInfo
@@ -80,11 +81,16 @@ def unpack(archive: Path, directory: Path) -> None:
 
 
 def is_intact(directory: Path) -> bool:
-    """Return True if nothing has changed below a directory since it was unpacked."""
+    """Return True if nothing has changed below a directory since it was unpacked.
+
+    Raises:
+        OSError: it cannot be looked at now.
+    """
     content = directory / CONTENT
     try:
         return all(map(_is_untouched, _paths(content)))
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return False
 
 

@@ -11,7 +11,6 @@ process leads no session of its own, so it has its descendants as members.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import re
 from collections.abc import Callable, Mapping
@@ -20,6 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.component.link import container_of
+from rosrm.shortage import SHORTAGE
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.supervisor.procfs import descendants, inner_pid
@@ -28,8 +28,6 @@ _TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 #: KiB of a process that the kernel cannot reclaim. Pages of files are shared and reclaimable, and a
 #: host's reading counts them at most once, so they would release too much of a reservation.
 _USED: Final = re.compile(rb"^Rss(?:Anon|Shmem):\s*(\d+)", re.MULTILINE)
-#: Errors after which a process may be there although its file cannot be opened now.
-_NOT_NOW: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +232,7 @@ def _content(path: str, most: int) -> bytes:
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError as error:
-        if error.errno in _NOT_NOW:
+        if error.errno in SHORTAGE:
             raise
         return b""
     try:

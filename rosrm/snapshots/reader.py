@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import mmap
 import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
+from rosrm.shortage import SHORTAGE
 from rosrm.snapshots.format import (
     LARGEST_REPLICA,
     Damaged,
@@ -27,8 +27,6 @@ SLOTS: Final = ("state.0", "state.1")
 COPY: Final = "copy"
 #: Flags of every file that is opened.
 OPEN: Final = os.O_CLOEXEC | os.O_NOFOLLOW
-#: Errors of a lack that ends: the file may be a snapshot.
-_FOR_NOW: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 #: Bytes that are read for a header; no header is larger.
 HEAD_ROOM: Final = 64 << 10
 
@@ -42,7 +40,7 @@ def peek(path: Path) -> Head | None:
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
     except OSError as error:
-        if error.errno in _FOR_NOW:
+        if error.errno in SHORTAGE:
             raise
         return None
     try:
@@ -106,7 +104,7 @@ def content_of(path: Path) -> bytes:
         with os.fdopen(descriptor, "rb") as file:
             return file.read(min(os.fstat(descriptor).st_size, LARGEST_REPLICA))
     except OSError as error:
-        if error.errno in _FOR_NOW:
+        if error.errno in SHORTAGE:
             raise
         raise Damaged(f"it cannot be read: {reason_of(error)}") from None
 

@@ -21,6 +21,7 @@ from typing import Any, Final
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
 from rosrm.runtime.signalling import send
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
@@ -315,8 +316,7 @@ def pids(group: str) -> list[int]:
         # More links: a process of the instance has made groups.
         below = _folders_in(group) if os.stat(group).st_nlink > _LINKS else ()
     except OSError as error:
-        if error.errno in procfs.NO_ROOM:
-            raise
+        raise_shortage(error)
         return []
     for name in below:
         found += pids(os.path.join(group, name))

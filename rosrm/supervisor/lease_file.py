@@ -13,6 +13,7 @@ from typing import Final
 
 from rosrm.core.supervisor.events import ContactReported
 from rosrm.runtime.private_files import open_private
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor import own_log, paths, procfs
 from rosrm.supervisor.file_thread import FileThread
 from rosrm.wording import reason_of
@@ -71,7 +72,7 @@ def read(state: str) -> ContactReported:
             boot, at, alive = file.read(100).split()
         newest = ContactReported(float(at), float(alive))
     except OSError as error:
-        procfs.check_room(error)
+        raise_shortage(error)
         return _NONE
     except ValueError:
         return _NONE

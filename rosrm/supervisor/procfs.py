@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from rosrm import clocks
+from rosrm.shortage import raise_shortage
 
 _TICKS_PER_SECOND: Final = os.sysconf("SC_CLK_TCK")
 
@@ -29,8 +30,6 @@ _EXECVE: Final = 1.0
 _LOOK: Final = 0.001
 #: Most bytes of one read.
 _PART: Final = 1 << 16
-#: Errors of a system without room for another descriptor: the process may run.
-NO_ROOM: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 
 
 class Stat(NamedTuple):
@@ -65,7 +64,7 @@ def read_stat(pid: int) -> Stat | None:
         with open(f"/proc/{pid}/stat", "rb") as file:
             text = file.read()
     except OSError as error:
-        check_room(error)
+        raise_shortage(error)
         return None
     # The second field, the name in brackets, may itself hold spaces and brackets.
     fields = text[text.rindex(b")") + 2 :].split()
@@ -73,12 +72,6 @@ def read_stat(pid: int) -> Stat | None:
         pid, fields[0].decode(), int(fields[1]), int(fields[2]), int(fields[3]), int(fields[19]),
         int(fields[6]),
     )  # fmt: skip
-
-
-def check_room(error: OSError) -> None:
-    """Raise an error that does not tell that a process has ended, or may not be read."""
-    if error.errno in NO_ROOM:
-        raise error
 
 
 def content(path: str) -> bytes:
@@ -184,7 +177,7 @@ def read_marks(pid: int) -> tuple[str, str]:
     try:
         variables = read_environment(pid)
     except OSError as error:
-        check_room(error)
+        raise_shortage(error)
         return "", ""
     marks = {}
     for variable in variables:
@@ -279,7 +272,7 @@ def _children_of(pid: int) -> list[int]:
             with open(children, "rb") as file:
                 found += file.read().split()
         except OSError as error:  # it may have ended
-            check_room(error)
+            raise_shortage(error)
     return [int(child) for child in found]
 
 
@@ -288,7 +281,7 @@ def _threads_of(pid: int) -> list[str]:
     try:
         return os.listdir(f"/proc/{pid}/task")
     except OSError as error:
-        check_room(error)
+        raise_shortage(error)
         return []
 
 
@@ -302,7 +295,7 @@ def command_line(pid: int) -> list[str]:
         with open(f"/proc/{pid}/cmdline", "rb") as file:
             text = file.read()
     except OSError as error:
-        check_room(error)
+        raise_shortage(error)
         return []
     return [os.fsdecode(word) for word in text.removesuffix(b"\0").split(b"\0")] if text else []
 
@@ -317,7 +310,7 @@ def user_ids(pid: int) -> set[int]:
         with open(f"/proc/{pid}/status", "rb") as file:
             text = file.read()
     except OSError as error:
-        check_room(error)
+        raise_shortage(error)
         return set()
     line = next(line for line in text.splitlines() if line.startswith(b"Uid:"))
     return {int(word) for word in line.split()[1:4]}

@@ -20,6 +20,7 @@ from rosrm import clocks, threads
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
+from rosrm.shortage import SHORTAGE
 from rosrm.slave.replication import fetch as fetching
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import SnapshotStore
@@ -42,7 +43,7 @@ _AGAIN: Final = 3.0
 #: Seconds until a search on this host is repeated that an error of a lack has ended.
 _SEARCH_AGAIN: Final = 1.0
 #: Errors of a lack, which may end at any moment.
-_OF_A_LACK: Final = (errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT)
+_OF_A_LACK: Final = SHORTAGE | {errno.ENOSPC, errno.EDQUOT}
 #: Most parts from other hosts that wait for the thread.
 _MOST_WAITING: Final = 64
 #: Codes of failures of the network alone.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 
 import pytest
 
+from rosrm.artifacts import unpack
 from rosrm.artifacts.cache import ArtifactCache
 from rosrm.artifacts.pack import Archive
 from rosrm.errors import Refused
@@ -148,6 +150,21 @@ def test_a_changed_artifact_is_fetched_again(cache, root, offered):
     assert cache.missing((one,), []) == [one]
     fetch(cache, one, content)
     assert (cache.assemble((one,)) / "a").read_bytes() == b"a" * 300_000
+
+
+def test_an_artifact_that_cannot_be_looked_at_now_is_kept(cache, offered, monkeypatch):
+    """A lack of descriptors tells nothing about its files."""
+    one, content = offered("a")
+    fetch(cache, one, content)
+
+    def lacks(_):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(unpack, "_is_untouched", lacks)
+        with pytest.raises(OSError, match="Too many open files"):
+            cache.missing((one,), [])
+    assert cache.missing((one,), []) == []
 
 
 def test_a_restart_keeps_what_is_complete(cache, root, offered):

@@ -27,9 +27,9 @@ _AGAIN: Final = "rosrm_criu/engine/restart_from_image.py"
 def children(pid: int) -> list[int]:
     """Return the children of all threads of a process, oldest first; none if it has ended."""
     found: list[int] = []
-    with contextlib.suppress(OSError):
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
         for thread in Path(f"/proc/{pid}/task").iterdir():
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(FileNotFoundError, ProcessLookupError):
                 found.extend(map(int, (thread / "children").read_text().split()))
     return found
 

@@ -30,6 +30,8 @@ from rosrm_criu.transfer.form import PART_HEAD, TAKEN, Offer, OfferResult
 _LOOPBACK: Final = "127.0.0.1"
 #: Seconds for a reader to complete the TLS handshake and to send the token.
 _GREETING: Final = 10.0
+#: Seconds until connections are accepted again, where there was no room for one.
+_ACCEPT_AGAIN: Final = 0.1
 #: Maximum number of connections, each with a thread, whose reader is not admitted yet.
 _MOST_STRANGERS: Final = 16
 #: Seconds of unused time that may be made up at once.
@@ -110,10 +112,12 @@ class _Server:
             self._listener.close()
 
     def _accept(self) -> None:
-        with contextlib.suppress(OSError):  # closed
-            while True:
+        while self._listener.fileno() >= 0:
+            try:
                 plain, _ = self._listener.accept()
                 threads.start(partial(self._converse, plain), "reader")
+            except OSError:  # closed, or no room for another connection now
+                self._over.wait(_ACCEPT_AGAIN)
 
     @contextlib.contextmanager
     def _greeting(self, new: ssl.SSLSocket) -> Iterator[None]:
