@@ -124,6 +124,25 @@ def test_a_supervisor_that_was_ended_by_another_is_replaced(loop) -> None:
     loop.wait(lambda: InstanceId("two", 1) in loop.started(), "the next one starts processes")
 
 
+def test_supervisors_that_end_again_and_again_are_reported_and_slowed(loop) -> None:
+    """The slave names the last one, when the next one starts, and the log that has the reason."""
+    pid = loop.pid
+    for number in (2, 3, 4):
+        assert loop.link.trouble(clocks.boot_time()) == ""
+        os.kill(pid, signal.SIGKILL)
+        wait_gone(pid)
+        if number < 4:
+            loop.wait(lambda number=number: len(loop.replaced()) == number, "the next one")
+            pid = loop.supervisor()
+    loop.wait(lambda: loop.link.trouble(clocks.boot_time()), "the slave reports them")
+    said = loop.link.trouble(clocks.boot_time())
+    assert said.startswith("3 supervisors in a row have ended within 10 s of their start")
+    assert f"(pid {pid})" in said
+    assert "the next one starts in 1 s" in said
+    loop.wait(lambda: len(loop.replaced()) == 4, "the next one starts after the pause")
+    loop.supervisor()
+
+
 def test_a_supervisor_that_cannot_start_does_not_end_the_slave(loop, monkeypatch) -> None:
     """The slave says why, refuses starts, and tries again until one starts."""
     connect, faults = SupervisorClient.connect, ["no room", "no room"]
