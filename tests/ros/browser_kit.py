@@ -15,6 +15,8 @@ BROWSER_PATIENCE = 3 * PATIENCE
 #: Link of `tab` over a bad mobile network: milliseconds of delay, bytes per second.
 SLOW_LINK = {"latency": 400, "downloadThroughput": 250_000, "uploadThroughput": 60_000}
 
+#: Looks of axe-core, each of about half a second, at a page that is being drawn.
+_LOOKS = 5
 _ALL_ROWS_HAVE_CELLS = """
     [...document.querySelectorAll("[role=row]")].every(
         row => row.querySelector("[role=columnheader], [role=rowheader], [role=gridcell]"))
@@ -67,9 +69,13 @@ def open_tab(page: Any, name: str) -> None:
 def serious_findings(page: Any) -> list[tuple[str, str]]:
     """Return the serious and critical findings of axe-core: each rule, and its first element.
 
-    The page draws a row before its cells, so wait until all rows have cells.
+    The page draws a row before its cells, also of the header: what one of a few looks does not
+    find was only being drawn.
     """
-    page.wait_for_function(_ALL_ROWS_HAVE_CELLS)
-    found = Axe().run(page).response["violations"]
-    serious = [one for one in found if one["impact"] in ("serious", "critical")]
+    for _ in range(_LOOKS):
+        page.wait_for_function(_ALL_ROWS_HAVE_CELLS)
+        found = Axe().run(page).response["violations"]
+        serious = [one for one in found if one["impact"] in ("serious", "critical")]
+        if not serious:
+            return []
     return [(one["id"], one["nodes"][0]["html"][:200]) for one in serious]
