@@ -25,7 +25,7 @@ from rosrm.archive.layout import (
 )
 from rosrm.archive.retention import ArchiveLimits, excess, is_within
 from rosrm.model.rows import LogPart
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.supervisor import log_index
 from rosrm.supervisor.log_index import Mark
@@ -254,7 +254,7 @@ def _compress(source: Path, target: Path) -> None:
     except FileNotFoundError:
         content = b""
     compressed = gzip.compress(content, 6, mtime=0)
-    os.close(atomic_file.replace(str(target), compressed, is_durable=True))
+    durable.replace_durably(str(target), compressed)
 
 
 def _remove(segment: Segment) -> None:

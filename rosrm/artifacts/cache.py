@@ -21,6 +21,7 @@ from rosrm.artifacts.unpack import CONTENT, is_intact, remove, unpack
 from rosrm.errors import Refused, TransferError
 from rosrm.model.artifacts import Artifact, set_key
 from rosrm.model.placeholders import ARTIFACTS
+from rosrm.runtime import durable
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.wording import reason_of
@@ -149,7 +150,7 @@ class ArtifactCache:
                 return  # a cancelled fetch of it had all parts, and completed after this one began
             unpack(incoming.path, directory)
             target.parent.mkdir(mode=0o700, exist_ok=True)
-            directory.rename(target)
+            durable.rename_durably(str(directory), str(target))
         except TransferError as error:
             raise Refused(f"artifact {artifact.name!r}: {error}", "damaged") from None
         except OSError as error:

@@ -16,7 +16,7 @@ from contextlib import suppress
 from typing import Final, NoReturn, TextIO
 
 from rosrm.cli.process import INTERRUPTED
-from rosrm.runtime.atomic_file import NO_ROOM
+from rosrm.runtime.durable import NO_ROOM
 from rosrm.runtime.process_end import end_now, flushed
 from rosrm.wording import reason_of
 

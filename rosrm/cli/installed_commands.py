@@ -23,7 +23,7 @@ from rosrm.extensions.guard import guarded
 from rosrm.extensions.installed import COMMANDS, PluginAddress, installed_plugins
 from rosrm.extensions.process_state import Interrupts
 from rosrm.model.rows import PluginRow
-from rosrm.runtime.atomic_file import NO_ROOM
+from rosrm.runtime.durable import NO_ROOM
 from rosrm.wording import listed
 
 #: Seconds for the import of a command; nothing but the command waits for it.

@@ -109,7 +109,7 @@ def _check_damaged(path: Path) -> None:
         raise JournalError(f"there is no journal to recover: {path} is no file")
     try:
         journal = SqliteJournal(path)
-        for table in ("cluster", "host", "process", "migration", "learned", "removed"):
+        for table in journal.tables():
             journal.intents(table)
         journal.close()
     except JournalError as fault:

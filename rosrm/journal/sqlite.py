@@ -168,6 +168,24 @@ class SqliteJournal:
                 database.execute("ROLLBACK")
             raise
 
+    def make_durable(self) -> None:
+        """Force all that was written to the disk: it survives the loss of power.
+
+        Raises:
+            JournalBlocked: a temporary failure; a retry is safe.
+            JournalError: the file is damaged.
+        """
+        self._guarded(lambda: self._database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone())
+
+    def tables(self) -> list[str]:
+        """Return the tables that have intents; raises `JournalError`."""
+        rows = self._guarded(
+            lambda: self._database.execute(
+                "SELECT DISTINCT tbl FROM intent ORDER BY tbl"
+            ).fetchall()
+        )
+        return [table for (table,) in rows]
+
     def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
         """Return all intents of a table by key."""
         rows = self._guarded(

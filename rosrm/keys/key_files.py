@@ -21,7 +21,7 @@ from rosrm.errors import ConfigError
 from rosrm.keys.cluster import ClusterSecret, PrincipalKey, own_grant
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.keys.roles import Grant, Principal, Role, principal_of
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import (
     make_private_directory,
     make_safe_directory,
@@ -354,12 +354,12 @@ def _text(fields: Mapping[str, Any]) -> str:
 
 
 def _write(path: Path, fields: Mapping[str, Any]) -> None:
-    """Replace a file atomically, with mode 0600, and sync it to the disk."""
+    """Replace a file durably, with mode 0600: a revoked key stays revoked after a loss of power."""
     content = _text(fields).encode()
     if len(content) > _LARGEST:
         raise ConfigError(f"{path} cannot be written: it would have more than {_LARGEST} bytes")
     try:
-        os.close(atomic_file.replace(str(path), content, os.O_SYNC))
+        durable.replace_durably(str(path), content)
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from None
 

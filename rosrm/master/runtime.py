@@ -243,6 +243,8 @@ class MasterRuntime:
             ],
             0.0,
         )
+        # Otherwise the next master would not notice that it lost this run.
+        self._journal.make_durable()
         self._record_from(state, now)
 
     def _last_run(self) -> _LastRun:

@@ -4,7 +4,7 @@ bootstrap.py       settings and plugins, passed from the command to the runtime
 local_zone.py      time zone of the machine
 state_lock.py      one runtime for one state directory
 private_files.py   owner, mode and links of directories and files
-atomic_file.py     replacement of a whole file, or of nothing
+durable.py         how state is written, and what survives a kill or the loss of power
 cgroups.py         control groups: mounts, the own group, delegation
 disk_space.py      free space on the disk of a directory
 addresses.py       IPv4 addresses of the network interfaces

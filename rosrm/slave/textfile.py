@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.model.values import InstanceState, InstanceStatus
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.runtime.path_calls import NoAnswer, at
 from rosrm.wording import reason_of
 
@@ -76,7 +76,8 @@ class Textfile:
         assert path is not None
         try:
             at(path)
-            os.close(atomic_file.replace(str(path), text_of(metrics, self._host), mode=_READABLE))
+            text = text_of(metrics, self._host)
+            os.close(durable.replace_atomically(str(path), text, mode=_READABLE))
         except (OSError, NoAnswer) as error:
             fault = reason_of(error)
         finally:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from rosrm.runtime import durable
 from rosrm.snapshots.format import Block, Damaged, Head, checked, decoded_head, encoded_head
 from rosrm.snapshots.reader import (
     COPY,
@@ -176,14 +177,14 @@ def check_origin(head: Head, process: str, age: tuple[int, int]) -> None:
 
 
 def write_slot(directory: Path, content: bytes) -> None:
-    """Replace the older one of a node's two snapshots by this content; raises `OSError`."""
+    """Replace the older one of a node's two snapshots durably by this content; raises `OSError`."""
     ages = {directory / name: _age_if_whole(directory / name) for name in SLOTS}
     begun = directory / _BEGUN
     begun.unlink(missing_ok=True)
     file = os.open(begun, os.O_WRONLY | os.O_CREAT | os.O_EXCL | OPEN, 0o600)
     try:
         _write_all(file, [content], 0)
-        begun.replace(min(ages, key=lambda path: ages[path]))
+        durable.rename_durably(str(begun), str(min(ages, key=lambda path: ages[path])))
     except OSError:
         begun.unlink(missing_ok=True)
         raise

@@ -40,7 +40,7 @@ from rosrm.core.supervisor.instance import (
 )
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import json_lines, messages, paths, procfs
 from rosrm.supervisor.file_thread import Call, FileThread
@@ -252,6 +252,7 @@ class InstanceRecord:
         # Of the thread:
         self._file = -1
         self._size = 0
+        self._has_header = False  # in the file, of this boot
         self._compact_at = COMPACT_BYTES
 
     def environment(self, identity: str, variables: Mapping[str, str]) -> None:
@@ -316,7 +317,10 @@ class InstanceRecord:
         for instance in core_state.instances.values():
             self.state(instance, birth(instance.key), kills(instance.key))
         if is_free:
-            self._begin(partial(self._replace, self._take_waiting(), waiting), is_whole=False)
+            text = self._take_waiting()
+            # Without a header of this boot, what runs would count as ended with the machine.
+            left = waiting if self._has_header else text
+            self._begin(partial(self._replace, text, left), is_whole=not self._has_header)
         else:
             self._is_whole = True
             self._compact_waiting_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._waiting_bytes)
@@ -373,10 +377,11 @@ class InstanceRecord:
         """Replace the file by a text; where that fails, `waiting` is still to be written."""
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * max(self._size, len(text)))
         try:
-            file = atomic_file.replace(self._path, text, os.O_APPEND)
+            file = durable.replace_atomically(self._path, text, os.O_APPEND)
         except Exception as error:  # noqa: BLE001 - as in `_append`
             return _Outcome(waiting, reason_of(error))
         former, self._file = self._file, file
+        self._has_header = True
         self._size = len(text)
         self._compact_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._size)
         if former >= 0:

@@ -17,7 +17,7 @@ import struct
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import open_private
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def size(log: str) -> int:
 
 def begin(log: str, mark: Mark, rest: bytes = b"") -> None:
     """Replace the index of a log file, as a whole."""
-    os.close(atomic_file.replace(path_of(log), _RECORD.pack(*mark) + rest))
+    os.close(durable.replace_atomically(path_of(log), _RECORD.pack(*mark) + rest))
 
 
 def base(log: str) -> int | None:

@@ -6,7 +6,6 @@ The order consists of command line, environment and parameters.
 from __future__ import annotations
 
 import base64
-import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION, Adoption
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.runtime.path_calls import at
 from rosrm.slave.launch import ament_index
 from rosrm.slave.launch.artifacts import with_artifacts
@@ -180,9 +179,9 @@ def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> bool:
     at(path)
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        os.close(atomic_file.replace(str(path), base64.b64encode(key)))
+        durable.replace_durably(str(path), base64.b64encode(key))
     except OSError as error:
-        if error.errno in atomic_file.NO_ROOM:
+        if error.errno in durable.NO_ROOM:
             return False
         raise LaunchError(f"the key of {instance} cannot be written: {reason_of(error)}") from None
     return True
@@ -215,8 +214,7 @@ def _write_parameters(assignment: Assignment, state_directory: Path) -> str | No
     at(path)
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        path.touch(0o600)
-        path.write_text(text, encoding="utf-8")
+        durable.replace_durably(str(path), text.encode())
     except OSError as error:
         raise LaunchError(f"the parameters cannot be written: {reason_of(error)}") from None
     return str(path)

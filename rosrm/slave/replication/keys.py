@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.keys.derivation import KEY_BYTES
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import open_private
 from rosrm.snapshots.format import Damaged
 from rosrm.snapshots.reader import SLOTS
@@ -91,13 +92,7 @@ class StateKeys:
     def _save(self, process: str) -> None:
         directory = self._directory_of(process)
         directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        draft = directory / f"{KEY}.new"
-        file = open_private(str(draft), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        try:
-            os.write(file, self._unsaved[process])
-        finally:
-            os.close(file)
-        draft.replace(directory / KEY)
+        durable.replace_durably(str(directory / KEY), self._unsaved[process])
         del self._unsaved[process]
 
     def _delete(self, process: str) -> None:

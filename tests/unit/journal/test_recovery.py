@@ -160,6 +160,14 @@ def test_all_hosts_must_report_before_work_is_assigned(path, recovered) -> None:
     assert recovered().intents("cluster")["epoch"] == {"epoch": 4, "boot": "recovered"}
 
 
+@pytest.mark.parametrize("table", ["application", "version", "mode"])
+def test_one_damaged_intent_of_any_table_is_recovered(path, recovered, table) -> None:
+    """The start that refuses the journal names the recovery, which must not refuse it too."""
+    with contextlib.closing(sqlite3.connect(path)) as database, database:
+        database.execute("INSERT INTO intent VALUES (?, 'a', 'no JSON')", (table,))
+    assert recovered().intents(table) == {}
+
+
 def test_a_whole_journal_is_left_alone(path) -> None:
     """`--recover` may stand in a start script."""
     before = path.read_bytes()

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.errors import ConfigError
-from rosrm.runtime import atomic_file, private_files
+from rosrm.runtime import durable, private_files
 from rosrm.runtime.private_files import (
     make_private_directory,
     make_private_file,
@@ -140,7 +140,7 @@ def test_a_fifo_in_place_of_a_file_is_refused_at_once(tmp_path, flags):
         open_private(str(tmp_path / "file"), flags)
     os.mkfifo(tmp_path / "made.new")
     with pytest.raises(OSError, match="it is no regular file"):
-        atomic_file.replace(str(tmp_path / "made"), b"x")
+        durable.replace_atomically(str(tmp_path / "made"), b"x")
 
 
 @as_root

@@ -211,6 +211,20 @@ def test_a_compaction_without_room_keeps_the_old_record(tmp_path, core, record, 
     assert rc.read(str(tmp_path)).instances[TALKER].exit_code == 3
 
 
+def test_a_record_that_begins_on_a_full_disk_gets_its_header_later(tmp_path, core, monkeypatch):
+    """Without it, the next supervisor would take what runs for processes of another boot."""
+    record = rc.InstanceRecord(str(tmp_path), DISK)
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "write", full)
+        record.rewrite(core, {TALKER: LAUNCH}, {"base": {}}, lambda key: 0)
+        assert not record.flush()
+    record.state(core.instances[TALKER], 55)
+    assert record.flush()
+    recorded = rc.read(str(tmp_path))
+    assert recorded.same_boot
+    assert recorded.instances[TALKER].pid == 100
+
+
 def test_it_is_compacted_when_it_has_grown(tmp_path, core, record):
     """Thousands of changes of one instance leave one line."""
     while not record.is_large():

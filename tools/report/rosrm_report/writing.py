@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from rosrm.errors import ConfigError
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.wording import reason_of
 from rosrm_report.extract import report_of
 from rosrm_report.model import Report
@@ -33,6 +33,6 @@ def write_page(report: Report, output: Path) -> None:
         ConfigError: the file cannot be written.
     """
     try:
-        os.close(atomic_file.replace(str(output), page_of(report).encode()))
+        os.close(durable.replace_atomically(str(output), page_of(report).encode()))
     except OSError as error:
         raise ConfigError(f"--output {output}: cannot be written: {reason_of(error)}") from None

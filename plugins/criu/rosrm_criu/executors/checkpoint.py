@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from rosrm import clocks
 from rosrm.errors import CriuError
+from rosrm.runtime import durable
 from rosrm_criu.engine import (
     dump,
     external_resources,
@@ -74,7 +75,11 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
                 find(), pid, directory, leave="stopped", timeout=asked.timeout,
                 process=asked.process, instance=asked.source,
             )  # fmt: skip
-        udp_ports.write(checkpoint_ports(asked.state, asked.source), udp_ports.bound(pids))
+        ports = checkpoint_ports(asked.state, asked.source)
+        udp_ports.write(ports, udp_ports.bound(pids))
+        # The process is killed next: only the image has its memory.
+        for written in (directory, ports, directory.parent):
+            durable.sync(str(written))
     return {"size": manifest.size, "seconds": {"dump": clocks.boot_time() - began}}
 
 

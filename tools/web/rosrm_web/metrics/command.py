@@ -17,7 +17,7 @@ from rosrm import clocks
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, seconds_of
 from rosrm.errors import ConfigError, NoMaster
-from rosrm.runtime import atomic_file
+from rosrm.runtime import durable
 from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
@@ -95,6 +95,6 @@ def _write(content: bytes, textfile: Path | None) -> None:
         return
     try:
         # The new content is in *.new at first: the collector reads *.prom only.
-        os.close(atomic_file.replace(str(textfile), content, mode=_READABLE))
+        os.close(durable.replace_atomically(str(textfile), content, mode=_READABLE))
     except OSError as error:
         raise ConfigError(f"--textfile {textfile}: cannot be written: {reason_of(error)}") from None

@@ -1,0 +1,129 @@
+"""How state is written. The name of each function says what its result survives.
+
+*Atomically* survives a kill: whenever the process ends, a reader finds the old content or the new
+one. After a loss of power the content of the last half minute may be missing; a file that is new
+since then may be empty, although its name, mode and time are there.
+
+*Durably* survives the loss of power: what the function has written, named or removed is on the disk
+when it returns. It may take as long as the disk needs, so no loop that keeps a lease calls it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from typing import Final
+
+from rosrm.runtime.private_files import open_private, write_all
+
+#: Errors of a file, such as the output, that takes no more data: a full disk, a quota, a limit of
+#: the size of files, a disk that fails or is read-only.
+NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+#: Mode that `open_private` gives.
+_PRIVATE: Final = 0o600
+
+
+def replace_atomically(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> int:
+    """Replace a file by a new one, and return the open descriptor of the new one.
+
+    After a failure the old file is unchanged, and no part of the new content is left: it would
+    take the room that a full disk no longer has.
+
+    Args:
+        path: of the file; the new content is first written to a file beside it.
+        content: of the new file.
+        flags: further flags of its descriptor.
+        mode: of the new file.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    return _replace(path, content, flags, mode, is_durable=False)
+
+
+def replace_durably(path: str, content: bytes, mode: int = _PRIVATE) -> None:
+    """Replace a file, as `replace_atomically`, and force the new one and its name to the disk.
+
+    Raises:
+        OSError: the file cannot be written. If its name cannot be forced to the disk, the new
+            content is there nevertheless.
+    """
+    os.close(_replace(path, content, 0, mode, is_durable=True))
+    sync_directory(os.path.dirname(path))
+
+
+def rename_durably(source: str, target: str) -> None:
+    """Force a file, or a directory with all that is in it, to the disk; then give it its name.
+
+    Raises:
+        OSError: it cannot be read, forced to the disk or renamed.
+    """
+    sync(source)
+    os.rename(source, target)
+    sync_directory(os.path.dirname(target))
+
+
+def remove_durably(path: str) -> None:
+    """Remove a file, and force that to the disk; raises `OSError`."""
+    os.unlink(path)
+    sync_directory(os.path.dirname(path))
+
+
+def sync(path: str) -> None:
+    """Force a file, or a directory with all that is in it, to the disk; raises `OSError`."""
+    if not os.path.isdir(path):
+        _sync_file(path)
+        return
+    for folder, _, files in os.walk(path, topdown=False, onerror=_fail):
+        for name in files:
+            file = os.path.join(folder, name)
+            if not os.path.islink(file):
+                _sync_file(file)
+        sync_directory(folder)
+
+
+def sync_directory(path: str) -> None:
+    """Force the names in a directory to the disk; raises `OSError`.
+
+    Some network file systems cannot do so for a directory; they keep names by other means.
+    """
+    directory = os.open(path or ".", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        os.fsync(directory)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+    finally:
+        os.close(directory)
+
+
+def _replace(path: str, content: bytes, flags: int, mode: int, *, is_durable: bool) -> int:
+    new = f"{path}.new"
+    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
+    try:
+        if mode != _PRIVATE:
+            os.fchmod(file, mode)
+        write_all(file, content)
+        if is_durable:
+            os.fsync(file)
+        os.replace(new, path)
+    except OSError:
+        with contextlib.suppress(OSError):  # the first fault is the reason
+            os.close(file)
+        with contextlib.suppress(OSError):
+            os.unlink(new)
+        raise
+    return file
+
+
+def _sync_file(path: str) -> None:
+    file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
+
+
+def _fail(error: OSError) -> None:
+    raise error

@@ -1,0 +1,63 @@
+"""Order in which state reaches the disk."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rosrm.runtime import durable
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the syncs, renames and removals that follow, with the names of their files."""
+    found: list[str] = []
+
+    def noted(call: Callable[..., Any], name: Callable[..., str]) -> Callable[..., Any]:
+        def noting(*arguments: Any, **options: Any) -> Any:
+            found.append(f"{call.__name__} {name(*arguments)}")
+            return call(*arguments, **options)
+
+        return noting
+
+    def of_descriptor(file: int) -> str:
+        return Path(f"/proc/self/fd/{file}").readlink().name
+
+    monkeypatch.setattr(os, "fsync", noted(os.fsync, of_descriptor))
+    for name in ("replace", "rename", "unlink"):
+        monkeypatch.setattr(os, name, noted(getattr(os, name), lambda *paths: Path(paths[-1]).name))
+    return found
+
+
+def test_a_file_is_on_the_disk_before_its_name_and_its_name_at_the_end(
+    tmp_path: Path, calls: list[str]
+) -> None:
+    path = tmp_path / "state"
+    durable.replace_durably(str(path), b"new")
+    assert calls == ["fsync state.new", "replace state", f"fsync {tmp_path.name}"]
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_all_in_a_directory_is_on_the_disk_before_it_is_renamed(
+    tmp_path: Path, calls: list[str]
+) -> None:
+    """Directories follow what is in them; links have no content of their own."""
+    inner = tmp_path / "new" / "inner"
+    inner.mkdir(parents=True)
+    (inner / "file").write_bytes(b"x")
+    (tmp_path / "new" / "link").symlink_to("/nowhere")
+    durable.rename_durably(str(tmp_path / "new"), str(tmp_path / "kept"))
+    assert calls == [
+        "fsync file", "fsync inner", "fsync new", "rename kept", f"fsync {tmp_path.name}",
+    ]  # fmt: skip
+
+
+def test_a_removal_is_on_the_disk(tmp_path: Path, calls: list[str]) -> None:
+    (tmp_path / "old").touch()
+    durable.remove_durably(str(tmp_path / "old"))
+    assert calls == ["unlink old", f"fsync {tmp_path.name}"]
