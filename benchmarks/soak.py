@@ -7,8 +7,10 @@ further batches, a slave or the master is killed and started again each time; th
 those of the other parts. A slope is the median of the slopes of all pairs of samples (Theil and
 Sen), by which one sample during an activity changes little.
 
-- `pss_bytes_a_job`, `descriptors_a_1000_jobs`, `threads_a_1000_jobs`: of each part. PSS counts a
-  page that N processes share as 1/N for each.
+- `uss_bytes_a_job`, `descriptors_a_1000_jobs`, `threads_a_1000_jobs`: of each part. USS counts the
+  pages that no other process has.
+- `pss_bytes_a_job`: the same with each page that N processes share as 1/N; so it also grows when
+  another program that runs Python ends on this machine.
 - `file_bytes_a_job`: of the state directory of each part, and of the master's journal.
 
 The master keeps `--keep-ended` ended processes and ten times as many events on purpose, a slave and
@@ -73,7 +75,9 @@ class Samples:
         self.jobs.append(jobs)
         for part, process in parts.items():
             with process.oneshot():
-                self._add(part, "pss", process.memory_full_info().pss)
+                memory = process.memory_full_info()
+                self._add(part, "uss", memory.uss)
+                self._add(part, "pss", memory.pss)
                 self._add(part, "descriptors", process.num_fds())
                 self._add(part, "threads", process.num_threads())
         for directory in [state / "master", *sorted((state / "hosts").iterdir())]:
@@ -89,6 +93,7 @@ class Samples:
     def growth(self, parts: Sequence[str]) -> dict[str, dict[str, float]]:
         """Return the slopes, in the units of the report."""
         units = {
+            "uss_bytes_a_job": ("uss", 1.0),
             "pss_bytes_a_job": ("pss", 1.0),
             "descriptors_a_1000_jobs": ("descriptors", 1e3),
             "threads_a_1000_jobs": ("threads", 1e3),

@@ -27,7 +27,7 @@ def test_no_part_grows_with_its_jobs() -> None:
     assert done.returncode == 0, done.stderr[-4000:]
     figures = json.loads(done.stdout.splitlines()[-1])
 
-    memory = figures["pss_bytes_a_job"]
+    memory = figures["uss_bytes_a_job"]
     bounds = {part: MASTER if part == "master" else PART for part in memory}
     assert {part: memory[part] for part in memory if memory[part] > bounds[part]} == {}
     # Three restarts are too few for a slope of memory: one growth at the first would be one.
