@@ -79,9 +79,9 @@ def cancel_groups(state: MasterState, now: float) -> None:
     A group is that of one user. Of processes that ended together, the first one is the cause.
     """
     ended, state.ended_members = state.ended_members, {}
-    for (principal, group), name in ended.items():
-        why = f"{name} of the group {group} {state.processes[name].phase.value}"
-        facts = {"group": group, "ended": name}
+    for (principal, group), first in ended.items():  # garbage collection may have removed it
+        why = f"{first.name} of the group {group} {first.phase.value}"
+        facts = {"group": group, "ended": first.name}
         for process in _others(state, principal, group):
             cancel(state, process, now, cause=why, facts=facts)
 

@@ -11,12 +11,11 @@ from rosrm.model.records import Intent
 
 
 def collect_garbage(state: MasterState) -> None:
-    """Remove terminal processes beyond the newest `keep_ended` that may be removed."""
-    excess = len(state.terminal) - state.settings.keep_ended
-    if excess <= 0:
+    """Keep the newest `keep_ended` of the terminal processes that may be removed."""
+    if len(state.terminal) <= state.settings.keep_ended:
         return
     gone = [name for name in state.terminal if is_gone(state, state.processes[name])]
-    for name in gone[:excess]:
+    for name in gone[: max(0, len(gone) - state.settings.keep_ended)]:
         remove_process(state, name)
 
 

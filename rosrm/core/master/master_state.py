@@ -152,7 +152,7 @@ class MasterState:
         self.applications: dict[str, Application] = {}
         self.modes = Modes()
         self.terminal: dict[str, None] = {}
-        self.ended_members: dict[tuple[str, str], str] = {}
+        self.ended_members: dict[tuple[str, str], Process] = {}
         self.instances: dict[int, Instance] = {}
         self.migrations: dict[str, Migration] = {}
         self.standbys: dict[str, Migration] = {}
@@ -368,7 +368,7 @@ class MasterState:
             self.gangs.leave(process)
         if ends_group(process):
             key = process.principal, process.spec.group.name
-            self.ended_members.setdefault(key, process.name)
+            self.ended_members.setdefault(key, process)
 
     def add_process(self, process: Process) -> None:
         """Add a process; it replaces a terminal one of the same name."""

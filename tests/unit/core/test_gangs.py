@@ -20,7 +20,7 @@ from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.preemption import preempt
 from rosrm.model.devices import Device, DeviceNeed
 from rosrm.model.requester import Requester
-from rosrm.model.values import HostLossPolicy, NeighbourRule, ProcessSpec
+from rosrm.model.values import HostLossPolicy, NeighbourRule, ProcessSpec, StartOrder
 from tests.unit.core.cluster import MIB, Cluster, Machine, job, movable, process
 
 
@@ -555,3 +555,14 @@ def test_a_search_gives_up_after_a_bounded_number_of_trials() -> None:
     cluster.settle()
     found = find_places(cluster.state, members_of(cluster.state, cluster["p0"]))
     assert isinstance(found, Blocked)
+
+
+def test_a_search_for_places_keeps_what_its_processes_wait_for() -> None:
+    """Otherwise a process of the gang started without waiting for the one that it starts after."""
+    cluster = Cluster("a")
+    cluster.submit(process("missing", required_labels={"no": "where"}))
+    after = StartOrder({"missing": "ready"})
+    cluster.submit(process("p", together="g", start_order=after), process("q", together="g"))
+    cluster.wait(1.0)
+    find_places(cluster.state, [cluster["p"], cluster["q"]])
+    assert cluster.state.queue.awaiting == {"p"}

@@ -158,3 +158,20 @@ def test_a_process_that_a_client_restarts_has_no_cause_left() -> None:
     cluster.cancel("slam")
     cluster.wait(1.0)
     assert (cluster.phase("slam"), cluster["slam"].reason) == ("cancelled", "")
+
+
+def test_finished_jobs_that_an_application_wants_take_no_place_of_the_others() -> None:
+    """They stay; the end of a process is still listed, and still ends its group."""
+    cluster = Cluster("a", keep_ended=3)
+    cluster.apply("batch", *[job(f"j{number}") for number in range(3)])
+    cluster.wait(1.0)
+    for number in range(3):
+        cluster.finish(f"j{number}")
+    cluster.wait(3.0)
+    group = GroupMembership("launch", "on-failure")
+    cluster.submit(process("p", group=group), process("q", group=group))
+    cluster.wait(1.0)
+    cluster.finish("p", code=7)
+    cluster.wait(1.0)
+    assert (cluster.phase("p"), cluster["p"].exit_code) == ("failed", 7)
+    assert cluster.phase("q") == "cancelled"

@@ -13,6 +13,7 @@ from rosrm.core.master.modes.settings import apply_settings
 from rosrm.core.master.modes.switching import mode_rows
 from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.applications import RolloutPolicy, Target
+from rosrm.model.ledger import BOUNDS, Amount, Store
 from rosrm.model.modes import Mode, Trigger
 from rosrm.model.values import (
     HostLossPolicy,
@@ -522,3 +523,27 @@ def test_modes_survive_a_restart_of_the_master() -> None:
     cluster.restart_master()
     assert mode_rows(cluster.state) == before
     assert cluster.state.modes.known["docked"].targets == DOCKED.targets
+
+
+def test_a_switch_that_makes_room_for_its_specs_may_remove_what_it_cancels(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An owner at the bound of what may be stored loses ended applications, the oldest first."""
+    bound = (Amount(50, 100 * 1024), Amount(500, 100 * 1024))
+    monkeypatch.setitem(BOUNDS, Store.SPECS, bound)  # type: ignore[misc]
+    cluster = Cluster("a")
+
+    def large(name: str, size: int) -> ProcessSpec:
+        return process(name, environment={"X": "x" * size * 1024})
+
+    docked = Mode("docked", (target("dock", large("charger", 36)),))
+    assert load(cluster, Mode("exploring", (target("map", large("mapper", 10)),)), docked).accepted
+    switch(cluster, "exploring")
+    cluster.apply("old", large("o", 20))
+    cluster.wait(1.0)
+    cluster.apply("old")
+    cluster.wait(1.0)
+    cluster.finish("mapper", code=1)
+    cluster.wait(1.0)
+    assert switch(cluster, "docked").accepted
+    assert "map" not in cluster.state.applications

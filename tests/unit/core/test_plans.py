@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import re
+import threading
 from typing import Any
 
 import pytest
 
+from rosrm.core.master.applications.planning import copied
 from rosrm.model.codec import from_plain, to_plain
 from rosrm.model.plan import (
     AwaitReady,
@@ -23,6 +25,7 @@ from rosrm.model.plan import (
     Stop,
 )
 from rosrm.model.values import InstanceId, RestartPolicy
+from tests.unit.core.cluster import Cluster
 
 ONE, MISSING = InstanceId("p", 1), object()
 EVERYTHING = Plan(
@@ -82,3 +85,15 @@ def test_a_plan_with_unknown_content_is_refused(path: Any, value: Any, fault: st
         inner[path[-1]] = value
     with pytest.raises(ValueError, match=re.escape(fault)):
         from_plain(Plan, plain)
+
+
+def test_a_plan_copies_no_plugin() -> None:
+    """A policy with a lock cannot be copied, and a copy of one would be called beside the guard."""
+
+    class Guarded:
+        def __init__(self) -> None:
+            self._lock = threading.Lock()
+
+    cluster = Cluster("a")
+    cluster.state.replication.policy = Guarded()  # type: ignore[assignment]
+    assert copied(cluster.state).replication.policy is cluster.state.replication.policy

@@ -100,7 +100,7 @@ def copied(state: MasterState) -> MasterState:
     """Return a copy of the state for a plan; immutable values and plugins are shared."""
     shared: list[Any] = [
         state.settings, state.declared, state.placement, state.strategies, state.plugins,
-        state.chain_of, EMPTY,
+        state.chain_of, state.replication.policy, EMPTY,
     ]  # fmt: skip
     for process in state.processes.values():
         shared += (process.spec, process.next_spec, process.plain, process.decision, process.demand)

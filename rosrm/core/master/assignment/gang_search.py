@@ -143,19 +143,15 @@ class _Search:
         saved = state.hosts.saved(host)
         instance = InstanceId(process.name, -len(self.places))  # no instance has such a number
         demand, devices = demand_of(state, process), self._devices(process, host)
-        queued = process.name in state.queue  # else it is set aside
-        if queued:
-            state.queue.remove(process.name)
-        state.add_instance(instance, process.spec, host, 0.0, demand, devices=devices)
-        process.owner = instance.number
-        try:
-            yield
-        finally:
-            process.owner = 0
-            state.drop_instance(state.instances[instance.number])
-            if queued:
-                state.queue.add(process.name, process.spec.priority, process.order)
-            state.hosts.restore(saved)
+        with state.queue.without(process.name):  # or it is set aside
+            state.add_instance(instance, process.spec, host, 0.0, demand, devices=devices)
+            process.owner = instance.number
+            try:
+                yield
+            finally:
+                process.owner = 0
+                state.drop_instance(state.instances[instance.number])
+                state.hosts.restore(saved)
 
 
 class _SearchIfEmpty(_Search):

@@ -142,7 +142,9 @@ def _switch(
     modes.met += [name for name in modes.retries if name in modes.known]
     modes.retries.clear()
     names = [target.application for target in targets]
-    modes.versions = {name: state.applications[name].wanted for name in names}
+    found = {name: state.applications.get(name) for name in names}
+    # A cancelled one may have been removed, to make room for the specs of another.
+    modes.versions = {name: one.wanted for name, one in found.items() if one is not None}
     if not returns:
         modes.fault.pop(mode.name, None)
     apply_settings(state)

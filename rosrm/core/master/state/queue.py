@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_left, insort
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 from rosrm.core.master.state.arrays import ArrayPlaces
 
@@ -44,6 +45,22 @@ class Queue:
         self.awaiting.discard(name)
         del self._keys[bisect_left(self._keys, key)]
         self.version += 1
+
+    @contextmanager
+    def without(self, name: str) -> Iterator[None]:
+        """Take a process out of the queue, if it is in it, until the end of the block."""
+        key = self._of.get(name)
+        if key is None:
+            yield
+            return
+        flags = [of for of in (self.delayed, self.awaiting) if name in of]
+        self.remove(name)
+        try:
+            yield
+        finally:
+            self.add(name, -key[0], key[1])
+            for of in flags:
+                of.add(name)
 
     def set_awaiting(self, name: str, *, awaiting: bool) -> None:
         """Note whether a process in the queue waits for other processes to start or finish."""
