@@ -56,6 +56,11 @@ class Refused(RosrmError):
         super().__init__(message)
         self.code = code
 
+    @property
+    def may_pass(self) -> bool:
+        """Return True if the same request may succeed later: the master cannot answer it now."""
+        return self.code in ("failed", "journal")
+
 
 class NoMaster(RosrmError):
     """No master answered in time."""

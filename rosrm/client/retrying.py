@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from rosrm import clocks
-from rosrm.errors import NoMaster
+from rosrm.errors import NoMaster, Refused
 
 if TYPE_CHECKING:
     from rosrm.ros.master_connection import OnWait
@@ -43,6 +43,7 @@ def ask_until_answered(
 
     Raises:
         NoMaster: the master was silent at the deadline.
+        Refused: the master refuses what it is asked, or could not answer until the deadline.
     """
     silent = failed = False
 
@@ -55,8 +56,9 @@ def ask_until_answered(
     while True:
         try:
             answer = look(on_wait)
-        except NoMaster as error:
-            if clocks.boot_time() >= deadline:
+        except (NoMaster, Refused) as error:
+            is_final = isinstance(error, Refused) and not error.may_pass
+            if is_final or clocks.boot_time() >= deadline:
                 raise
             if not failed:
                 notify(f"{error} Asking again until the master answers")

@@ -17,7 +17,7 @@ from rosrm.cli.output.tables import event_line
 from rosrm.cli.process import INTERRUPTED
 from rosrm.cli.up.cluster import UpCluster
 from rosrm.client.waiting import ENDED
-from rosrm.errors import NoMaster, RosrmError
+from rosrm.errors import NoMaster, Refused, RosrmError
 from rosrm.model.applications import Target
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow
@@ -174,7 +174,7 @@ def _submit(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
 def _new_events(cluster: UpCluster, after: int) -> Sequence[EventRow]:
     try:
         return cluster.client.list(events=True, after=after, newest=_ALL_NEW).events
-    except NoMaster as error:
+    except (NoMaster, Refused) as error:  # the request is valid, so any refusal may pass
         cluster.check_parts()  # the error of a master that has ended says more
         _say(str(error))
         return ()
