@@ -108,10 +108,9 @@ def _check_damaged(path: Path) -> None:
     if not path.is_file():
         raise JournalError(f"there is no journal to recover: {path} is no file")
     try:
-        journal = SqliteJournal(path)
-        for table in journal.tables():
-            journal.intents(table)
-        journal.close()
+        with contextlib.closing(SqliteJournal(path)) as journal:
+            for table in journal.tables():
+                journal.intents(table)
     except JournalError as fault:
         if "damaged" not in str(fault):
             raise

@@ -85,6 +85,14 @@ class SqliteJournal:
         if self._path.is_file() and not self._path.stat().st_size:
             raise sqlite3.DatabaseError("it is empty: not even tables are in it")
         database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
+        try:
+            self._prepare(database, sync)
+        except BaseException:  # also an interrupt must leave no open file
+            database.close()
+            raise
+        return database
+
+    def _prepare(self, database: sqlite3.Connection, sync: str) -> None:
         database.execute("PRAGMA journal_mode=WAL")
         self._make_private()  # SQLite creates its files by the umask
         database.execute(f"PRAGMA journal_size_limit={_LONGEST_LOG}")
@@ -99,7 +107,6 @@ class SqliteJournal:
         if version == 0:
             self._make(database)
         database.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
-        return database
 
     def _make_private(self) -> None:
         """Keep the intents, which hold environments, from other users."""

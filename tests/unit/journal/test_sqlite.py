@@ -127,7 +127,10 @@ def change(path, *statements: str) -> None:
             database.execute(statement)
 
 
-INDEX = "UPDATE sqlite_schema SET sql = replace(sql, '!= ', '= ') WHERE name = 'record_process'"
+INDEX = (
+    "UPDATE sqlite_schema SET sql = replace(sql, '(process)', '(host)') "
+    "WHERE name = 'record_process'"
+)
 
 
 @pytest.mark.parametrize(

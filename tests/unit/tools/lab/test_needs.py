@@ -82,6 +82,7 @@ def test_too_little_memory_is_refused(monkeypatch, tmp_path, machine, limit, sai
     for name, text in (("max", limit), ("current", GIB), ("stat", "inactive_file 0")):
         (tmp_path / f"memory.{name}").write_text(f"{text}\n")
     monkeypatch.setattr("psutil.virtual_memory", lambda: SimpleNamespace(available=machine))
+    monkeypatch.setattr(needs, "find_command", lambda name: name)
     hosts = uniform(3, memory=512 * MIB, disk=16 * MIB)
     with pytest.raises(LabError, match=f"1536 MiB of memory together, and {said}"):
         needs.check_machine(hosts, Path("/"), container)
