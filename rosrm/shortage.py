@@ -1,6 +1,7 @@
 """Errors that tell what the machine or this process lacks now, not what a file or process is.
 
-Whoever takes one for "it does not exist" ends a process that runs, or deletes the only copy.
+Code that took one of them for "it does not exist" ended a process that runs, or deleted the only
+copy of a state.
 """
 
 from __future__ import annotations

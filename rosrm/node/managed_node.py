@@ -425,7 +425,7 @@ class NodeEntities:
     def _next_step(self) -> bool:
         """Do the next step of some ms, between new messages; return False if there is none.
 
-        A step of the author may raise, and the executor may go on: the others follow.
+        If a step of the author raises and the executor continues, the other steps follow.
         """
         if self.mode is not Mode.ACTIVE or not self._steps:
             return False

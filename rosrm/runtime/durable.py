@@ -1,11 +1,11 @@
-"""How state is written. The name of each function says what its result survives.
+"""Functions that write state. The name of each one says what its result survives.
 
 *Atomically* survives a kill: whenever the process ends, a reader finds the old content or the new
 one. After a loss of power the content of the last half minute may be missing; a file that is new
 since then may be empty, although its name, mode and time are there.
 
-*Durably* survives the loss of power: what the function has written, named or removed is on the disk
-when it returns. It may take as long as the disk needs, so no loop that keeps a lease calls it.
+*Durably* survives the loss of power: what the function has written and named is on the disk when it
+returns. It may take as long as the disk needs, so no loop that keeps a lease calls it.
 """
 
 from __future__ import annotations
@@ -62,12 +62,6 @@ def rename_durably(source: str, target: str) -> None:
     sync(source)
     os.rename(source, target)
     sync_directory(os.path.dirname(target))
-
-
-def remove_durably(path: str) -> None:
-    """Remove a file, and force that to the disk; raises `OSError`."""
-    os.unlink(path)
-    sync_directory(os.path.dirname(path))
 
 
 def sync(path: str) -> None:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.component.link import container_of
-from rosrm.shortage import SHORTAGE
+from rosrm.shortage import raise_shortage
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.supervisor.procfs import descendants, inner_pid
@@ -232,8 +232,7 @@ def _content(path: str, most: int) -> bytes:
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError as error:
-        if error.errno in SHORTAGE:
-            raise
+        raise_shortage(error)
         return b""
     try:
         return os.read(descriptor, most)

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final
 
-from rosrm.shortage import SHORTAGE
+from rosrm.shortage import raise_shortage
 from rosrm.snapshots.format import (
     LARGEST_REPLICA,
     Damaged,
@@ -40,8 +40,7 @@ def peek(path: Path) -> Head | None:
     try:
         descriptor = os.open(path, os.O_RDONLY | OPEN)
     except OSError as error:
-        if error.errno in SHORTAGE:
-            raise
+        raise_shortage(error)
         return None
     try:
         return decoded_head(os.read(descriptor, HEAD_ROOM))[0]
@@ -104,8 +103,7 @@ def content_of(path: Path) -> bytes:
         with os.fdopen(descriptor, "rb") as file:
             return file.read(min(os.fstat(descriptor).st_size, LARGEST_REPLICA))
     except OSError as error:
-        if error.errno in SHORTAGE:
-            raise
+        raise_shortage(error)
         raise Damaged(f"it cannot be read: {reason_of(error)}") from None
 
 

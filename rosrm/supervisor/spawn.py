@@ -16,15 +16,14 @@ import signal
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, NoReturn
 
+from rosrm.shortage import SHORTAGE
 from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
 from rosrm.wording import reason_of
 
 #: Seconds for the steps of one start; after them, the path of the current step has no answer.
 PATIENCE: Final = 10.0
 #: Errors that may pass: the same spawn is tried again where the restart policy allows.
-TRANSIENT: Final = frozenset(
-    {errno.EAGAIN, errno.ENOMEM, errno.EMFILE, errno.ENFILE, errno.ETXTBSY, errno.EIO}
-)
+TRANSIENT: Final = SHORTAGE | {errno.EAGAIN, errno.ETXTBSY, errno.EIO}
 #: Bytes of one read of a report.
 _PART: Final = 1 << 16
 #: First letters of the messages in a report; a NUL byte ends each.

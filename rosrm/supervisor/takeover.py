@@ -34,7 +34,8 @@ from rosrm.supervisor.procfs import Stat
 def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
     """Read the record into the core, and take over the leaders that still run."""
     recorded = instance_record.read(state)
-    core.dead.update(recorded.dead)
+    for process, number in recorded.dead.items():
+        core.dead.put(process, number)
     newest = lease_file.read(state)
     for instance in recorded.instances.values():
         if not recorded.same_boot:

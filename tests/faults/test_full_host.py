@@ -73,14 +73,14 @@ def test_one_disk_for_all_that_a_robot_writes(tmp_path, monkeypatch) -> None:
         make = opened.enter_context(clusters(lambda: disk.place / "c"))
         cluster = make(host("h0"), liveness=LIVENESS)
         work = disk.place / "work"
-        (work / "goes on").touch()
-        waits = "while [ -e 'goes on' ]; do sleep 0.05; done; echo done; exit 7"
+        (work / "wait").touch()
+        waits = "while [ -e wait ]; do sleep 0.05; done; echo done; exit 7"
         place = {"working_directory": str(work)}
         cluster.submit(service("runs", **place), job("ends", "sh", "-c", waits, **place))
         runs = cluster.wait("runs", "running")
         cluster.wait("ends", "running")
         disk.fill()
-        (work / "goes on").unlink()
+        (work / "wait").unlink()
         cluster.wait_until("the full disk is reported", lambda view: view.trouble != "")
         cluster.slaves["h0"].process.kill()
         cluster.slaves["h0"].process.wait(PATIENCE)

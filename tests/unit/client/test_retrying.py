@@ -17,7 +17,7 @@ def _soon(monkeypatch: pytest.MonkeyPatch) -> None:
     "fault", [NoMaster("silence"), Refused("no memory", "failed"), Refused("full", "journal")]
 )
 def test_what_may_pass_is_waited_for(fault: Exception) -> None:
-    """A job whose state cannot be listed for a moment goes on, and so does the command."""
+    """`rosrm run` continues while the state of its job cannot be listed for a moment."""
     faults, said = [fault, fault], []
 
     def look(_: object) -> str:

@@ -455,7 +455,7 @@ def test_a_new_version_of_a_service_that_finishes_is_given_up() -> None:
 
 
 def test_a_new_version_is_not_well_while_its_host_is_silent() -> None:
-    """It crashed in the silence: its host reports that only after `healthy_for`."""
+    """The version crashed during the silence; its host reports that only after `healthy_for`."""
     cluster = Cluster("a")
     spec = movable("p", restart=RestartPolicy("on-failure"))
     cluster.apply("nav", spec)

@@ -180,7 +180,7 @@ def test_no_spec_changes_where_a_process_of_another_user_may_run(naming: str) ->
 
 @pytest.mark.parametrize("priority", [0, 99])
 def test_a_process_that_waits_for_room_holds_back_none_of_another_user(priority: int) -> None:
-    """It may wait for ever, for room beside what always runs there; its owner's wait with it."""
+    """The process may wait for ever. Only later processes of its owner wait behind it."""
     cluster = Cluster(Machine("a", memory=1000 * MIB))
     submit(cluster, ALICE, process("own", memory=300))
     cluster.wait(3.0)

@@ -14,7 +14,7 @@ from rosrm.runtime import durable
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return the syncs, renames and removals that follow, with the names of their files."""
+    """Return the syncs and renames that follow, with the names of their files."""
     found: list[str] = []
 
     def noted(call: Callable[..., Any], name: Callable[..., str]) -> Callable[..., Any]:
@@ -28,7 +28,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return Path(f"/proc/self/fd/{file}").readlink().name
 
     monkeypatch.setattr(os, "fsync", noted(os.fsync, of_descriptor))
-    for name in ("replace", "rename", "unlink"):
+    for name in ("replace", "rename"):
         monkeypatch.setattr(os, name, noted(getattr(os, name), lambda *paths: Path(paths[-1]).name))
     return found
 
@@ -55,9 +55,3 @@ def test_all_in_a_directory_is_on_the_disk_before_it_is_renamed(
     assert calls == [
         "fsync file", "fsync inner", "fsync new", "rename kept", f"fsync {tmp_path.name}",
     ]  # fmt: skip
-
-
-def test_a_removal_is_on_the_disk(tmp_path: Path, calls: list[str]) -> None:
-    (tmp_path / "old").touch()
-    durable.remove_durably(str(tmp_path / "old"))
-    assert calls == ["unlink old", f"fsync {tmp_path.name}"]

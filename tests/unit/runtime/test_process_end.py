@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -31,7 +32,7 @@ def test_a_part_ends_although_a_plugin_has_left_something(left: str) -> None:
 
 
 def test_a_part_whose_terminal_was_closed_ends_with_its_code() -> None:
-    """What it has written last cannot be written any more."""
+    """The last output of the process cannot be written any more."""
     terminal, its_end = os.openpty()
     program = (
         "import sys; from rosrm.runtime.process_end import end_process\n"
@@ -44,7 +45,7 @@ def test_a_part_whose_terminal_was_closed_ends_with_its_code() -> None:
     os.close(its_end)
     assert b"ready" in os.read(terminal, 100)
     os.close(terminal)
-    process.communicate(b"go on\n", timeout=60.0)
+    process.communicate(b"continue\n", timeout=60.0)
     assert process.returncode == 7
 
 
@@ -54,17 +55,12 @@ COMMANDS = {"plugins --local": 0, "config check work.yaml": 0, "master --config 
 
 @pytest.mark.parametrize(("words", "code"), COMMANDS.items())
 def test_a_command_ends_although_a_plugin_has_left_a_thread(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, code: int
+    tmp_path: Path, imported: Callable[[str], None], words: str, code: int
 ) -> None:
     """Otherwise a service manager would take a master with invalid settings for one that runs."""
-    folder = tmp_path / "guest-1.dist-info"
-    folder.mkdir()
-    (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: guest\nVersion: 1\n")
-    (folder / "entry_points.txt").write_text("[rosrm]\nguest = guest\n")
-    (tmp_path / "guest.py").write_text(f"import threading, time\n{LEFT_BEHIND['a thread']}\n")
+    imported(f"import threading, time\n{LEFT_BEHIND['a thread']}\n")
     (tmp_path / "work.yaml").write_text("processes: [{name: p, command: sleep 1}]\n")
     (tmp_path / "invalid.yaml").write_text("scoring: {policy: nosuch}\n")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     command = [sys.executable, "-m", "rosrm.cli", *words.split()]
     ended = subprocess.run(command, cwd=tmp_path, timeout=60.0, check=False)
     assert ended.returncode == code

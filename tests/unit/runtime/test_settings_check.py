@@ -8,7 +8,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -57,21 +56,6 @@ def test_an_invalid_file_yields_place_and_allowed_values(tmp_path: Path) -> None
     assert "did you mean 'limits'?" in fault
     path.write_text("host: h\nlimits: {memory: 0.5}\n")
     assert outcome(SettingsSource("slave", str(path)))[0].limits["memory"]
-
-
-@pytest.fixture
-def imported(tmp_path: Path, monkeypatch) -> Callable[[str], None]:
-    """Return a function that installs a plugin, whose code the check runs at its start."""
-
-    def install(code: str) -> None:
-        folder = tmp_path / "talker-1.dist-info"
-        folder.mkdir()
-        (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: talker\nVersion: 1\n")
-        (folder / "entry_points.txt").write_text("[rosrm]\ntalker = talker\n")
-        (tmp_path / "talker.py").write_text(code)
-        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-
-    return install
 
 
 def test_what_a_plugin_prints_is_no_part_of_the_settings(tmp_path: Path, imported) -> None:

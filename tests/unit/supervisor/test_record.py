@@ -12,9 +12,10 @@ import pytest
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import EXITED, Instance
-from rosrm.core.supervisor.reducer import SupervisorState
+from rosrm.core.supervisor.reducer import MOST_TOMBSTONES, SupervisorState
 from rosrm.core.supervisor.rules import LimitRule, RestartRule, RunLimits, StopRule
 from rosrm.supervisor import instance_record as rc
+from rosrm.supervisor import takeover
 from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.messages import Amend, Launch
 from tests.waiting import PATIENCE, wait_until
@@ -153,6 +154,17 @@ def test_the_number_of_a_forgotten_instance_is_kept(tmp_path, record):
     core.dead.update(recorded.dead)
     record.rewrite(core, {}, {}, lambda key: 0)
     assert rc.read(str(tmp_path)).dead == {"talker": 7}
+
+
+def test_the_numbers_that_are_taken_over_are_bounded(tmp_path, record):
+    """A record between two compactions may have more of them than a supervisor keeps."""
+    for number in range(MOST_TOMBSTONES + 10):
+        record.dead((f"p{number}", 1), 1)
+    assert record.flush()
+    core = SupervisorState()
+    takeover.restore(str(tmp_path), core, trees=None)  # none of its leaders runs
+    assert len(core.dead) == MOST_TOMBSTONES
+    assert f"p{MOST_TOMBSTONES + 9}" in core.dead
 
 
 def test_another_boot_is_noticed(tmp_path, record, monkeypatch):

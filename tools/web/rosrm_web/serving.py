@@ -19,6 +19,7 @@ import uvicorn
 from rosrm import clocks
 from rosrm.errors import ConfigError, NoMaster, Refused
 from rosrm.runtime.dispositions import handle
+from rosrm.shortage import SHORTAGE
 from rosrm.wording import reason_of
 from rosrm_web.access import Access
 from rosrm_web.app import create_app
@@ -37,7 +38,7 @@ _BACKLOG: Final = 64
 #: Open files that the gateway needs at most: connections, and ROS.
 _DESCRIPTORS: Final = 8192
 #: Errors of a process or machine without room for another open file.
-_NO_ROOM: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM})
+_NO_ROOM: Final = SHORTAGE | {errno.ENOBUFS}
 #: Least seconds between two log lines about them.
 _LOGGED_EVERY: Final = 10.0
 

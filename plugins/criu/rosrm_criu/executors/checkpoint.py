@@ -78,8 +78,9 @@ def _keep_alone(asked: StepArguments) -> Mapping[str, Any]:
         ports = checkpoint_ports(asked.state, asked.source)
         udp_ports.write(ports, udp_ports.bound(pids))
         # The process is killed next: only the image has its memory.
-        for written in (directory, ports, directory.parent):
+        for written in (directory, ports):
             durable.sync(str(written))
+        durable.sync_directory(str(directory.parent))
     return {"size": manifest.size, "seconds": {"dump": clocks.boot_time() - began}}
 
 
