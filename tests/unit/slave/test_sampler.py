@@ -193,8 +193,9 @@ def test_hanging_probe_is_late_after_its_deadline_and_not_asked_again(bad):
     """
     probe, made = bad
     probe.gate.clear()
+    reads = probe.reads + 1
     made.tick(1, settle=False)
-    reads = probe.reads
+    wait_until(lambda: probe.reads == reads, "the read that hangs")
     assert made.tick(9, settle=False).stale == 0
     sample = made.tick(3, settle=False)
     assert (sample.usage[0], sample.stale) == (0.25, 1)
