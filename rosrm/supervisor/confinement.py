@@ -12,8 +12,8 @@ from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime.signalling import send
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
-from rosrm.supervisor.spawn import TRANSIENT, Attempt, Scheduler
-from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
+from rosrm.supervisor.spawn import Attempt, Scheduler
+from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError, is_transient
 from rosrm.wording import by_reason, listed, reason_of
 
 #: In place of the descriptor of a control group.
@@ -142,7 +142,7 @@ class Confinement:
                     attempt = spawn(group, scheduler)
                 return (yield attempt), faults
             except OSError as error:
-                if error.errno in TRANSIENT:
+                if is_transient(error):
                     raise
                 fault = f"its control group cannot be entered: {reason_of(error)}"
                 # A supervisor beside this one may have removed the group, because it was empty.
@@ -179,7 +179,7 @@ def _on_cpus(cpus: tuple[int, ...], own: set[int]) -> Iterator[None]:
         os.sched_setaffinity(0, cpus)
     except OSError as error:
         fault = f"{cpus_in_words(list(cpus))} cannot be used: {reason_of(error)}"
-        raise SpawnError(fault) from None
+        raise SpawnError.of(fault, error) from None
     try:
         yield
     finally:

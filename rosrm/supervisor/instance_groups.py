@@ -25,6 +25,7 @@ from rosrm.shortage import raise_shortage
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
+from rosrm.supervisor.spawn_error import is_transient
 from rosrm.wording import counted, reason_of, size
 
 #: Most walks over the processes of a group of version 1, which may fork.
@@ -84,8 +85,9 @@ class InstanceGroups:
 
         After a fault the next `make` tries again, because the fault may be over by then.
         """
-        if not self.make(key, limits, realtime=realtime):
-            self._prepared[key] = limits
+        with contextlib.suppress(OSError):
+            if not self.make(key, limits, realtime=realtime):
+                self._prepared[key] = limits
 
     def make(self, key: Key, limits: LimitRule, *, realtime: bool) -> dict[str, str]:
         """Make the group of an instance with its limits; return the faults by limit.
@@ -93,11 +95,14 @@ class InstanceGroups:
         Args:
             realtime: leave out groups of the controller cpu of version 1, which by default allow
                 no real-time scheduling, and whose limits have no effect on it.
+
+        Raises:
+            OSError: required limits cannot be set, by an error that may pass (`is_transient`).
         """
         if self._prepared.pop(key, None) == limits:
             return {}
         faults: dict[str, str] = {}
-        made, is_new = [], True
+        self._made[key], is_new = (), True
         for tree in self.trees:
             if not self._needs(tree, limits, realtime=realtime):
                 continue
@@ -105,15 +110,15 @@ class InstanceGroups:
             self._emptied.pop(path, None)  # otherwise the new run would be killed
             try:
                 is_new = _make(path, tree) and is_new
-                made.append(tree)
+                self._made[key] += (tree,)
                 faults.update(_set_limits(path, tree, limits))
             except OSError as error:
+                _raise_transient(error, limits)
                 fault = f"no control group {path} can be made: {reason_of(error)}"
                 faults.update(
                     (name, fault) for name, controller in _CONTROLLER.items()
                     if controller in tree.controllers
                 )  # fmt: skip
-        self._made[key] = tuple(made)
         self._unset[key] = {name.removeprefix("limits."): 0.0 for name in faults}
         self._kills_before[key] = 0 if is_new else self._kills(key)
         return faults
@@ -391,8 +396,19 @@ def _set_limits(
             # Version 1 refuses a share above that of a group above, which then is the limit.
             if error.errno == errno.EINVAL and file == "cpu.cfs_quota_us":
                 continue
+            if former is _UNLIMITED:
+                _raise_transient(error, limits)
             faults.setdefault(name, _why(path, file, error, limits))
     return faults
+
+
+def _raise_transient(error: OSError, limits: LimitRule) -> None:
+    """Raise an error that may pass, where the limits are required.
+
+    Otherwise this host would count as one that cannot enforce them.
+    """
+    if limits.required and is_transient(error):
+        raise error
 
 
 def _why(path: str, file: str, error: OSError, limits: LimitRule) -> str:

@@ -30,7 +30,8 @@ def read(name: str, path: str) -> str:
         content = _content(path)
     except (OSError, ValueError) as error:  # ValueError: a path that cannot be encoded
         reason = getattr(error, "strerror", None) or "no path of a file"
-        raise SpawnError(f"the secret {name} cannot be read: {path!r}: {reason}") from None
+        fault = f"the secret {name} cannot be read: {path!r}: {reason}"
+        raise SpawnError.of(fault, error) from None
     if content is None:
         raise SpawnError(f"the secret {name} cannot be read: {path!r} is not a regular file")
     if len(content) > MOST_BYTES:

@@ -51,7 +51,7 @@ from rosrm.supervisor.log_calls import LogCalls
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import INSTANCE_MARK, SUPERVISOR_MARK
-from rosrm.supervisor.spawn_error import SpawnError
+from rosrm.supervisor.spawn_error import SpawnError, is_transient
 from rosrm.wording import listed, reason_of
 
 #: Maximum number of starts before their exec at a time.
@@ -334,7 +334,8 @@ class Server:
                 self._spawn_failed(key, _no_room(error), transient=True)
             except Exception as fault:  # noqa: BLE001 - the core counts on an outcome of each
                 own_log.write_fault(f"the start of {mark(key)} failed")
-                self._spawn_failed(key, f"its start failed in the supervisor: {fault!r}", False)
+                failed = f"its start failed in the supervisor: {fault!r}"
+                self._spawn_failed(key, failed, is_transient(fault))
         self._spawns.extendleft(reversed(delayed))
 
     def _late_disk(self) -> FileThread | None:

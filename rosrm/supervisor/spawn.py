@@ -9,21 +9,20 @@ the child, which names the step that the child is at. A successful exec closes t
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import resource
 import signal
+import stat
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, NoReturn
 
 from rosrm.shortage import SHORTAGE
-from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
+from rosrm.supervisor import exec_failures, secret_files  # a child may be unable to load them
+from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError, is_transient
 from rosrm.wording import reason_of
 
 #: Seconds for the steps of one start; after them, the path of the current step has no answer.
 PATIENCE: Final = 10.0
-#: Errors that may pass: the same spawn is tried again where the restart policy allows.
-TRANSIENT: Final = SHORTAGE | {errno.EAGAIN, errno.ETXTBSY, errno.EIO}
 #: Bytes of one read of a report.
 _PART: Final = 1 << 16
 #: First letters of the messages in a report; a NUL byte ends each.
@@ -119,7 +118,7 @@ def begin(
 
     Raises:
         SpawnError: no process can be forked.
-        OSError: the control group is gone, or the system has no room, see `TRANSIENT`.
+        OSError: the control group is gone, or the system has no room, see `is_transient`.
     """
     report, told = os.pipe2(os.O_CLOEXEC)
     parent = os.getpid()
@@ -181,7 +180,8 @@ def _become(
         kind = _NO_SCHEDULE if isinstance(error, ScheduleRefused) else _FAULT
         tell(_TRANSIENT_FAULT if error.transient else kind, str(error))
     except BaseException as fault:  # noqa: BLE001 - the child must not return into the caller
-        tell(_FAULT, f"{program.argv[0]!r} cannot be started: {fault}")
+        kind = _TRANSIENT_FAULT if is_transient(fault) else _FAULT
+        tell(kind, f"{program.argv[0]!r} cannot be started: {reason_of(fault)}")
     finally:
         os._exit(127)
 
@@ -210,12 +210,9 @@ def _execute(
     environment, directory = dict(program.environment), program.directory
     tell(_STEP, f"the working directory {directory!r}")
     _enter(directory)
-    if program.secrets:
-        from rosrm.supervisor import secret_files  # noqa: PLC0415 - only secrets need it
-
-        for name, path in program.secrets.items():
-            tell(_STEP, f"the file {path!r} of the secret {name}")
-            environment[name] = secret_files.read(name, path)
+    for name, path in program.secrets.items():
+        tell(_STEP, f"the file {path!r} of the secret {name}")
+        environment[name] = secret_files.read(name, path)
     word = program.argv[0]
     if "/" not in word:
         tell(_STEP, f"a directory of the PATH, {environment.get('PATH', os.defpath)!r},")
@@ -231,10 +228,8 @@ def _execute(
     try:
         os.execve(path, program.argv, environment)  # noqa: S606 - no shell is wanted
     except OSError as error:
-        from rosrm.supervisor import exec_failures  # noqa: PLC0415 - only a failure needs it
-
         reason = exec_failures.reason(os.path.join(directory, path), error)
-        raise SpawnError(reason, transient=error.errno in TRANSIENT) from None
+        raise SpawnError.of(reason, error) from None
     except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
         raise SpawnError(f"{word!r} cannot be started: {error}") from None
 
@@ -245,7 +240,7 @@ def _enter(directory: str) -> None:
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         reason = reason_of(error)
         message = f"the working directory {directory!r} cannot be entered: {reason}"
-        raise SpawnError(message) from None
+        raise SpawnError.of(message, error) from None
 
 
 def find_executable(word: str, environment: Mapping[str, str]) -> str:
@@ -253,11 +248,22 @@ def find_executable(word: str, environment: Mapping[str, str]) -> str:
     if "/" in word:
         return word
     search = environment.get("PATH", os.defpath)
-    reason = f"program {word!r} is not on the PATH"
+    denied, unseen = "", None  # the first of each kind
     for directory in search.split(os.pathsep):
         path = os.path.join(directory or ".", word)
-        if os.path.isfile(path):
-            if os.access(path, os.X_OK):
-                return path
-            reason = f"program {word!r} on the PATH, {path}, is not executable"
-    raise SpawnError(f"{reason}\nthe PATH is {search}")
+        try:
+            is_file = stat.S_ISREG(os.stat(path).st_mode)
+        except OSError as error:
+            found = SpawnError.of(
+                f"{path} on the PATH cannot be looked at: {reason_of(error)}", error
+            )
+            if error.errno in SHORTAGE:  # another directory may have another program of this name
+                raise found from None
+            unseen = unseen or (found if found.transient else None)
+            continue
+        if is_file and os.access(path, os.X_OK):
+            return path
+        denied = denied or (path if is_file else "")
+    if denied and not unseen:
+        return denied  # its exec tells why it is refused
+    raise unseen or SpawnError(f"program {word!r} is not on the PATH\nthe PATH is {search}")

@@ -124,6 +124,8 @@ def _check_program(word: str, environment: dict[str, str]) -> None:
     try:
         path = find_executable(word, environment)
     except SpawnError as error:
+        if error.transient:  # the program may be there, and its exec reports what it lacks
+            return
         raise LaunchError(str(error)) from None
     if path.startswith("/") and not os.access(path, os.X_OK):
         raise LaunchError(f"no executable {path!r} exists")

@@ -108,9 +108,10 @@ def _absolute(word: str, facts: ProcessFacts) -> Path:
 
 def _names_program(word: str, facts: ProcessFacts) -> bool:
     try:
-        return Path(facts.directory, on_path(word, facts.environment)).is_file()
+        path = Path(facts.directory, on_path(word, facts.environment))
     except SpawnError:
         return False
+    return path.is_file() and os.access(path, os.X_OK)
 
 
 def _package_of(path: Path, facts: ProcessFacts) -> dict[str, Any]:

@@ -123,6 +123,42 @@ def test_a_group_that_cannot_be_made_refuses_a_start_that_requires_it(confinemen
         finish(confinement.start(KEY, LimitRule(memory=1e8, required=True), not_started))
 
 
+@pytest.mark.parametrize("call", ["mkdir", "open"])
+@pytest.mark.parametrize("ahead", [True, False])
+def test_a_shortage_while_a_group_is_made_excludes_no_host(
+    confinement, tmp_path, monkeypatch, call, ahead
+) -> None:
+    """The start is tried again; what was made of the groups is removed with the instance."""
+    top = tmp_path / "top"
+    top.mkdir()
+    confinement.groups = groups = InstanceGroups([Tree(1, str(top), str(tmp_path), ("memory",))])
+    limits = LimitRule(memory=1e8, required=True)
+
+    def lack(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, call, lack)
+        if ahead:
+            confinement.prepare(KEY, limits)
+        else:
+            with pytest.raises(OSError, match="Cannot allocate memory"):
+                finish(confinement.start(KEY, limits, not_started))
+    groups.remove(KEY, 0.0)
+    assert not list(top.iterdir())
+
+
+def test_cpus_that_cannot_be_set_for_now_exclude_no_host(confinement, monkeypatch) -> None:
+    def lack(*_: object) -> None:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+
+    monkeypatch.setattr(os, "sched_setaffinity", lack)
+    limits = LimitRule(cpus=(min(os.sched_getaffinity(0)),))
+    with pytest.raises(SpawnError, match="Cannot allocate memory") as failed:
+        finish(confinement.start(KEY, limits, not_started))
+    assert failed.value.transient
+
+
 def test_limits_that_change_without_a_group_do_not_hold(confinement, full) -> None:
     """They are refused where they are required."""
     confinement.groups = full
