@@ -24,6 +24,7 @@ from rosrm.model.placeholders import ARTIFACTS
 from rosrm.runtime import durable
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
+from rosrm.shortage import exists, is_directory
 from rosrm.wording import reason_of
 from rosrm.wording import size as sized
 
@@ -109,10 +110,10 @@ class ArtifactCache:
         found: dict[str, Artifact] = {}
         for one in artifacts:
             tree = self._tree(one)
-            if tree.is_dir() and (one.digest in in_use or is_intact(tree)):
+            if is_directory(tree) and (one.digest in in_use or is_intact(tree)):
                 os.utime(tree)  # the time of its last use
                 continue
-            if tree.exists():
+            if exists(tree):
                 self._delete(tree, used)
             found[one.digest] = one
         return list(found.values())

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosrm.model.values import InstanceId
+from rosrm.shortage import is_directory
 from rosrm.supervisor.instance_groups import group_name, pids
 
 #: Control groups of a supervisor: version, directory and controllers of each.
@@ -49,7 +50,7 @@ class InstanceGroup:
         first, memory, cpu = "", ("", 0), ("", 0)
         for version, top, controllers in self._trees:
             group = str(Path(top, self._name))
-            if not Path(group).is_dir():
+            if not is_directory(group):
                 continue
             first = first or group
             if "memory" in controllers:

@@ -13,6 +13,7 @@ from rosrm.errors import Refused
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceId
 from rosrm.ros.slave.services import LogQuery
+from rosrm.shortage import exists
 from rosrm.supervisor import log_index, paths
 from rosrm.supervisor.client import log_path
 from rosrm.wording import reason_of
@@ -60,7 +61,7 @@ def read_log(state_directory: Path, query: LogQuery, *, ended: bool, pid: int = 
             part = _read(path, _segments(path), query, numbers, ended=ended, pid=pid)
             after = log_index.base(str(path))
         except FileNotFoundError:
-            if not path.exists():
+            if not exists(path):
                 break
             continue  # rotated during the read
         except OSError as error:
@@ -87,14 +88,17 @@ def _logged(state_directory: Path, process: str) -> list[int]:
     """Return the numbers of the instances of a process that have a log, ascending."""
     wanted = paths.safe_name(process)
     folder = Path(paths.log_folder(str(state_directory)))
-    found = [paths.log_number(path.name) for path in folder.glob("*.log")]
+    try:
+        found = [paths.log_number(path.name) for path in folder.iterdir()]
+    except FileNotFoundError:
+        return []
     return sorted(log[1] for log in found if log is not None and log[0] == wanted)
 
 
 def _segments(path: Path) -> list[_Segment]:
     """Return the files of a log, the oldest first."""
     files, number = [path], 1
-    while (older := path.with_name(f"{path.name}.{number}")).exists():
+    while exists(older := path.with_name(f"{path.name}.{number}")):
         files.append(older)
         number += 1
     segments: list[_Segment] = []

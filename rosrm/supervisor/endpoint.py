@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import socket
@@ -117,7 +118,7 @@ def release_lock() -> None:
 
 def _bind(state: str) -> socket.socket:
     path = os.path.join(state, paths.SOCKET)
-    if os.path.lexists(path):
+    with contextlib.suppress(FileNotFoundError):
         os.unlink(path)  # left by a killed supervisor, because this process holds the lock
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     directory = os.open(state, os.O_PATH | os.O_DIRECTORY | os.O_CLOEXEC)

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from rosrm.runtime import cgroups
+from rosrm.shortage import is_directory
 from rosrm.wording import reason_of
 
 #: Prefix of the group that contains the groups of one supervisor.
@@ -110,7 +111,7 @@ def _tree(mount: cgroups.Mount, known: set[str], name: str, root: str) -> Tree |
     controllers = tuple(one for one in _CONTROLLERS if one in useful)
     top = os.path.join(base, name)
     tree = Tree(mount.version, top, home, controllers)
-    if not os.path.isdir(top):
+    if not is_directory(top):
         try:
             make_repeatedly(lambda: make_top(tree))
         finally:

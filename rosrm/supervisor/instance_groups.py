@@ -21,7 +21,7 @@ from typing import Any, Final
 from rosrm.core.supervisor.rules import Key, LimitRule
 from rosrm.runtime import cgroups
 from rosrm.runtime.signalling import send
-from rosrm.shortage import raise_shortage
+from rosrm.shortage import is_directory, raise_shortage
 from rosrm.supervisor import own_log, procfs
 from rosrm.supervisor.group_trees import PREFIX, Tree, make_repeatedly, make_top
 from rosrm.supervisor.paths import safe_name
@@ -66,12 +66,15 @@ class InstanceGroups:
 
         Args:
             live: each instance that has not ended, with its `kills_before`.
+
+        Raises:
+            OSError: the group of one of them cannot be looked at now; nothing was killed.
         """
         for key, kills in live.items():
-            found = tuple(tree for tree in self.trees if os.path.isdir(_path(tree, key)))
+            found = tuple(tree for tree in self.trees if is_directory(_path(tree, key)))
             if found:
                 self._made[key], self._kills_before[key] = found, kills
-        known = {group_name(key) for key in self._made}
+        known = set(map(group_name, live))
         for tree in self.trees:
             for name in _folders(tree.top) - known:
                 self._end(os.path.join(tree.top, name), 0.0)
@@ -158,8 +161,8 @@ class InstanceGroups:
                 with contextlib.suppress(OSError):
                     cgroups.write(os.path.join(tree.home, "cgroup.procs"), str(pid))
         remove_empty(path)
-        if os.path.isdir(path):  # a process has forked during the loop
-            self._unfinished.setdefault(key, set()).add(tree)
+        # A process may have forked during the loop.
+        self._unfinished.setdefault(key, set()).add(tree)
 
     def lacking(self, key: Key, limits: LimitRule) -> dict[str, str]:
         """Return the limits for which an instance has no group, with the reasons."""

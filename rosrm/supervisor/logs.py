@@ -390,7 +390,7 @@ def _copy(log: int, target: str, offset: int, end: int) -> None:
 def _rename(log: str, to: str) -> None:
     """Rename a log file together with its index, where one exists."""
     for source, target in ((log, to), (log_index.path_of(log), log_index.path_of(to))):
-        if os.path.exists(source):
+        with contextlib.suppress(FileNotFoundError):
             os.replace(source, target)
 
 

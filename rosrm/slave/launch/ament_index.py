@@ -15,6 +15,7 @@ from typing import Final
 
 from rosrm.errors import LaunchError
 from rosrm.runtime.path_calls import at
+from rosrm.shortage import is_directory, is_file
 from rosrm.wording import get_close_matches, listed
 
 _PACKAGES = "share/ament_index/resource_index/packages"
@@ -45,7 +46,7 @@ def find_executable(package: str, executable: str, prefixes: Sequence[Path]) -> 
     prefix = find_package(package, prefixes)
     path = prefix / "lib" / package / executable
     at(path)
-    if not path.is_file():
+    if not is_file(path):
         near = _near(executable, _executables(path.parent))
         raise LaunchError(
             f"the package {package!r} has no executable {executable!r}: "
@@ -60,7 +61,7 @@ def find_package(package: str, prefixes: Sequence[Path]) -> Path:
     """Return the prefix of a package; raises `LaunchError` with the searched places."""
     for prefix in prefixes:
         at(prefix)
-        if (prefix / _PACKAGES / package).is_file():
+        if is_file(prefix / _PACKAGES / package):
             return prefix
     where = ", ".join(str(prefix) for prefix in prefixes)
     known = {name for prefix in prefixes for name in _listed(prefix / _PACKAGES)}
@@ -77,7 +78,7 @@ def _executables(folder: Path) -> list[str]:
 
 def _listed(folder: Path) -> list[str]:
     at(folder)
-    return sorted(entry.name for entry in folder.iterdir()) if folder.is_dir() else []
+    return sorted(entry.name for entry in folder.iterdir()) if is_directory(folder) else []
 
 
 def _near(name: str, known: Sequence[str]) -> str:

@@ -16,6 +16,7 @@ from typing import Final
 from rosrm.keys.derivation import KEY_BYTES
 from rosrm.runtime import durable
 from rosrm.runtime.private_files import open_private
+from rosrm.shortage import exists
 from rosrm.snapshots.format import Damaged
 from rosrm.snapshots.reader import SLOTS
 
@@ -69,7 +70,7 @@ class StateKeys:
     def drop(self, process: str, up_to: int) -> None:
         """Delete the key of instances up to a number, unless the node has snapshots here."""
         directory = self._directory_of(process)
-        if any((directory / name).exists() for name in SLOTS):
+        if any(exists(directory / name) for name in SLOTS):
             return
         try:
             record = self._record_of(process)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import stat
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,6 +14,7 @@ from rosrm import clocks
 from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
+from rosrm.shortage import exists, status
 from rosrm.slave.replication.encryption import decrypted, encrypted
 from rosrm.slave.replication.keys import StateKeys
 from rosrm.snapshots.format import LARGEST_REPLICA, Damaged, Head, TransferPart
@@ -110,7 +112,7 @@ class SnapshotStore:
 
     def is_used(self) -> bool:
         """Return True if this host ever stored a snapshot."""
-        return self._root.exists()
+        return exists(self._root)
 
     def scan(self) -> tuple[SnapshotReport, ...]:
         """Return the newest snapshot of each process.
@@ -135,9 +137,11 @@ class SnapshotStore:
             paths = sorted(self._root.iterdir())
         except FileNotFoundError:
             return []
-        for link in [path for path in paths if path.is_symlink() and not path.exists()]:
-            link.unlink(missing_ok=True)  # an old name of a directory whose snapshots were dropped
-        return [path for path in paths if path.is_dir() and not path.is_symlink()]
+        for path in paths:
+            if not exists(path):  # an old name of a directory whose snapshots were dropped
+                path.unlink(missing_ok=True)
+        found = ((path, status(path, follow_symlinks=False)) for path in paths)
+        return [path for path, one in found if one is not None and stat.S_ISDIR(one.st_mode)]
 
     def _rename(self, directory: Path, process: str) -> None:
         """Rename a directory to which an earlier release gave another name, and leave a link.
@@ -145,7 +149,7 @@ class SnapshotStore:
         The supervisor restarts an instance with the path that it had at its first start.
         """
         right = self.directory(process)
-        if directory != right and not right.exists():
+        if directory != right and not exists(right):
             with contextlib.suppress(OSError):
                 directory.rename(right)
                 directory.symlink_to(right.name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import time
@@ -35,6 +36,36 @@ def log(tmp_path):
 def read(tmp_path, offset=0, most=0, *, ended=False, pid=0, **more):
     query = LogQuery(P.process, P.number, offset, max_bytes=most, **more)
     return read_log(tmp_path, query, ended=ended, pid=pid)
+
+
+def lack_memory_at(monkeypatch, end: str) -> None:
+    """Let the status of a file be unknown for lack of memory."""
+    real = os.stat
+
+    def look(path, *others, **options):
+        if os.fspath(path).endswith(end):
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+        return real(path, *others, **options)
+
+    monkeypatch.setattr(os, "stat", look)
+
+
+def test_a_rotation_that_lacks_memory_overwrites_no_older_file(log, monkeypatch):
+    older = log.with_name(f"{log.name}.1")
+    older.write_bytes(b"older")
+    lack_memory_at(monkeypatch, ".1")
+    rotate(str(log), 10, LogLimits(max_bytes=10, keep=2))
+    monkeypatch.undo()
+    assert log.with_name(f"{log.name}.2").read_bytes() == b"older"
+
+
+def test_older_files_that_cannot_be_looked_at_are_not_gone(tmp_path, log, monkeypatch):
+    """Otherwise a reader would continue behind them."""
+    rotate(str(log), 10, LogLimits(max_bytes=10, keep=1))
+    log.write_bytes(b"new")
+    lack_memory_at(monkeypatch, ".1")
+    with pytest.raises(Refused, match="cannot be read: Cannot allocate memory"):
+        read(tmp_path)
 
 
 def everything(tmp_path, **more):

@@ -409,6 +409,33 @@ def test_the_next_supervisor_knows_the_kills_of_earlier_runs(files) -> None:
         assert after.kills_before(KEY) == 2
 
 
+@pytest.mark.parametrize("number", [errno.ENOMEM, errno.EIO, errno.EACCES])
+def test_the_group_of_a_live_instance_that_cannot_be_looked_at_is_no_left_over(
+    files, monkeypatch, number: int
+) -> None:
+    """Otherwise a supervisor that takes over would kill what runs."""
+    before, group = files
+    left_over = group.with_name("lidar.1")
+    (left_over / "inner").mkdir(parents=True)
+    killed: list[str] = []
+    real = os.stat
+
+    def look(path, *others, **options):
+        if os.fspath(path) == str(group):
+            raise OSError(number, os.strerror(number))
+        return real(path, *others, **options)
+
+    monkeypatch.setattr(os, "stat", look)
+    monkeypatch.setattr(instance_groups, "kill", killed.append)
+    with pytest.raises(OSError, match=os.strerror(number)):
+        InstanceGroups(before.trees).find_again({KEY: 0})
+    assert not killed  # the next supervisor begins with all that was there
+    monkeypatch.undo()
+    monkeypatch.setattr(instance_groups, "kill", killed.append)
+    InstanceGroups(before.trees).find_again({KEY: 0})
+    assert killed == [str(left_over)]
+
+
 def test_a_host_without_control_groups_says_so(tmp_path: Path) -> None:
     """Each limit has a reason, which names what is missing."""
     (tmp_path / "proc/self").mkdir(parents=True)
