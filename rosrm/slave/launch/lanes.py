@@ -73,6 +73,7 @@ class Lanes:
         call.settled = True
         if call.timer is not None:
             call.timer.cancel()
+            call.timer = None  # it refers to the call; only a collection of garbage frees a cycle
         if call.thread:  # late
             interrupt_thread(call.thread)
         calls = self._lanes[lane]

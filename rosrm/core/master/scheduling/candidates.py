@@ -19,8 +19,14 @@ from rosrm.model.values import EMPTY, ProcessSpec
 Columns = slice | IntArray
 
 
+class _Referable:
+    """Base of a class with slots to which weak references are possible."""
+
+    __slots__ = ("__weakref__",)
+
+
 @dataclass(slots=True)  # not frozen, because each of thousands would take 1 µs more to create
-class Candidates:
+class Candidates(_Referable):
     """Some hosts, n of them, with one demand.
 
     The arrays have all that assignments change. They are copies if `columns` is an array.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, TypeVar
+from weakref import proxy
 
 import numpy as np
 import numpy.typing as npt
@@ -24,13 +25,18 @@ T = TypeVar("T")
 
 
 def host_view(hosts: Candidates) -> HostView:
-    """Return the view of some hosts for a plugin, the same one for all plugins."""
+    """Return the view of some hosts for a plugin, the same one for all plugins.
+
+    It does not keep the hosts. A cycle in each of the thousands of decisions that a master keeps
+    would be freed only by a full collection of garbage, which is rare.
+    """
     if hosts.view is None:
+        weak = proxy(hosts)
         hosts.view = _View(
-            _Names(hosts), hosts.resources, _read_only(hosts.busy.T),
+            _Names(weak), hosts.resources, _read_only(hosts.busy.T),
             _read_only(hosts.cells[LIMIT].T), _read_only(hosts.cells[CAPACITY].T),
-            _read_only(hosts.processes[:]), _Labels(hosts), _Links(hosts), _Tenants(hosts),
-            _FreeDevices(hosts),
+            _read_only(hosts.processes[:]), _Labels(weak), _Links(weak), _Tenants(weak),
+            _FreeDevices(weak),
         )  # fmt: skip
     return hosts.view
 
