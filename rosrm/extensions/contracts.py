@@ -80,7 +80,8 @@ class DeviceFinding(Protocol):
         """Return every device, also one that is `missing` now, with the reason; units are fixed.
 
         Called after each `read`, in the same thread, also if `read` raised. The settings of the
-        host take precedence: they choose the units of a kind.
+        host take precedence: they choose the units of a kind. The slave ends a process whose device
+        is missing, so raise where the probe cannot tell; then all devices stay as they were.
         """
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
@@ -10,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from rosrm.errors import describe_fault
 from rosrm.model.devices import MOST_DEVICES, Device
 from rosrm.runtime.path_calls import PathCall, RunPath, at
 from rosrm.wording import listed, reason_of, sanitized
@@ -19,21 +21,33 @@ _log = logging.getLogger("rosrm.slave")
 #: Seconds between two looks at the devices.
 LOOK_PERIOD: Final = 1.0
 
+#: Errors of a file that is not there. After any other error, the look was not made.
+_ABSENT: Final = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ENODEV, errno.ENXIO})
+
 _Units = Mapping[str, Device]
 
 
 def file_fault(path: str) -> str:
-    """Return why the file of a device is not there; "": it is."""
+    """Return why the file of a device is not there; "": it is.
+
+    Raises:
+        OSError: the look was not made, such as without a free file descriptor.
+    """
     try:
         at(path)
         Path(path).stat()
     except OSError as error:
+        if error.errno not in _ABSENT:
+            raise
         return f"{path}: {reason_of(error)}"
     return ""
 
 
 class FileFaults:
     """Faults of the files of devices, checked in a thread, because a file may not answer.
+
+    After a look that was not made the last fault stays, because the end of a process that holds
+    the device follows from a fault.
 
     Args:
         run: as `PathCalls.run`.
@@ -44,19 +58,30 @@ class FileFaults:
         self._run, self._changed = run, changed
         self._faults: dict[str, str] = {}
         self._looks: dict[str, PathCall] = {}
+        self._unknown: set[str] = set()
 
     def __call__(self, path: str) -> str:
         """Return the newest known fault of a file, and begin to look at the file again."""
         if path not in self._looks or self._looks[path].has_ended:
-            seen = partial(self._seen, path)
-            self._looks[path] = self._run(partial(file_fault, path), seen, lambda it: seen(str(it)))
+            self._looks[path] = self._run(
+                partial(file_fault, path), partial(self._seen, path), partial(self._missed, path)
+            )
         return self._faults.get(path, "")
 
     def _seen(self, path: str, fault: str) -> None:
         before = self._faults.get(path, "")
         self._faults[path] = fault
+        self._unknown.discard(path)
         if fault != before:
             self._changed()
+
+    def _missed(self, path: str, error: Exception) -> None:
+        if path not in self._unknown:
+            _log.info(
+                "device file %s: not checked, so the last state stays (%s): %s",
+                path, self._faults.get(path) or "it is there", describe_fault(error),
+            )  # fmt: skip
+        self._unknown.add(path)
 
 
 class DeviceWatch:
@@ -77,9 +102,7 @@ class DeviceWatch:
         self.devices: tuple[Device, ...] = ()
         self.lost: Mapping[tuple[str, str], str] = {}
 
-    def look(
-        self, found: Mapping[str, tuple[Device, ...]], fault_of: Callable[[str], str] = file_fault
-    ) -> bool:
+    def look(self, found: Mapping[str, tuple[Device, ...]], fault_of: Callable[[str], str]) -> bool:
         """Look at each device once, and log changes; return True if there are any.
 
         Args:

@@ -64,7 +64,7 @@ from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import end_start, handle_signals
-from rosrm.runtime.path_calls import PathCalls, at
+from rosrm.runtime.path_calls import PathCalls, at, run_at_once
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.artifacts.service import ArtifactService
@@ -167,7 +167,7 @@ class SlaveRuntime:
             self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
             self._absent, first = self._open_probes(registry, sessions, opened)
             self._devices = DeviceWatch(config.devices)
-            self._devices.look(self._sampler.devices)
+            self._devices.look(self._sampler.devices, FileFaults(run_at_once, lambda: None))
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._settings_check.hang_up)
             opened.callback(self._settings_check.close)

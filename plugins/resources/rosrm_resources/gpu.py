@@ -24,6 +24,9 @@ from rosrm import (
 )
 
 _LIBRARY: Final = "libnvidia-ml.so.1"
+#: Codes of the driver's errors about a GPU that is not there: NOT_FOUND, GPU_IS_LOST and
+#: GPU_NOT_FOUND, which older versions of `pynvml` do not name.
+_ABSENT: Final = frozenset({6, 15, 28})
 #: Inode of the first pid namespace (`PROC_PID_INIT_INO` of the kernel).
 _FIRST_PID_NAMESPACE: Final = 0xEFFFFFFC
 
@@ -149,11 +152,15 @@ class GpuProbe:
         return labels
 
     def devices(self) -> Sequence[Device]:
-        """Return each GPU; one about which the driver raises an error is missing."""
-        return [
-            replace(device, missing=self._fault(handle))
+        """Return each GPU; one that the driver does not find, or that has left its bus, is missing.
+
+        After any other error of the driver, a GPU stays as it was, because processes end with it.
+        """
+        self._devices = [
+            replace(device, missing=self._fault(handle, device.missing))
             for device, handle in zip(self._devices, self._handles, strict=True)
         ]
+        return self._devices
 
     def close(self) -> None:
         """Shut down the connection to the driver."""
@@ -166,12 +173,12 @@ class GpuProbe:
         self._resources.append(ResourceDescription(name, unit, capacity, "machine", accounting))
         self._reads[name] = usage
 
-    def _fault(self, handle: Any) -> str:
-        """Return the error of the driver about a GPU, such as one that fell off its bus."""
+    def _fault(self, handle: Any, before: str) -> str:
+        """Return why a GPU is missing; "": it is there. Where the driver cannot tell: as before."""
         try:
             self._nvml.nvmlDeviceGetUUID(handle)
         except self._nvml.NVMLError as error:
-            return f"NVML: {error}"
+            return f"NVML: {error}" if error.value in _ABSENT else before
         return ""
 
     def _about(self, handle: Any) -> str:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import errno
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
 
+from rosrm import threads
 from rosrm.core.slave.watches import Memo
-from rosrm.errors import LaunchError
+from rosrm.errors import LaunchError, describe_fault
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
-from rosrm.model.values import Assignment, InstanceId, ProcessSpec
-from rosrm.slave.devices import DeviceWatch
+from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
+from rosrm.runtime.path_calls import NoAnswer, PathCalls, run_at_once
+from rosrm.slave.devices import DeviceWatch, FileFaults
 from rosrm.slave.launch.command import order_of, plain_launch
 from rosrm.slave.launch.environment import ProcessLocation
 from rosrm.slave.launch.launchers import Launchers
@@ -24,6 +28,11 @@ from tests.waiting import PATIENCE
 GPU = Device("gpu", "0", about="a model")
 
 
+def looked(watch: DeviceWatch, found=EMPTY) -> bool:
+    """Look at the devices and their files once."""
+    return watch.look(found, FileFaults(run_at_once, lambda: None))
+
+
 # --- the devices of a host -----------------------------------------------------------------------
 
 
@@ -31,20 +40,75 @@ def test_a_device_whose_file_is_gone_is_missing_until_the_file_is_back(tmp_path:
     """The device is lost after two looks, so that a driver may start again."""
     path = tmp_path / "video0"
     watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
-    assert watch.look({})
+    assert looked(watch)
     gone = f"{path}: No such file or directory"
     assert ([one.missing for one in watch.devices], watch.lost) == ([gone], {})
-    assert not watch.look({})
+    assert not looked(watch)
     assert watch.lost == {("camera", "front"): gone}
     path.touch()
-    assert watch.look({})
+    assert looked(watch)
     assert ([one.missing for one in watch.devices], watch.lost) == ([""], {})
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        OSError(errno.EMFILE, "Too many open files"), PermissionError(errno.EACCES, "no"),
+        OSError(errno.ESTALE, "Stale file handle"), NoAnswer("/dev/x does not answer (10 s)"),
+        MemoryError(),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_look_that_cannot_be_made_leaves_a_device_as_it_was(
+    tmp_path, monkeypatch, caplog, error, is_there
+) -> None:
+    """Otherwise a shortage of this machine would end each process that holds a device."""
+    path = tmp_path / "video0"
+    path.touch()
+    watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
+    faults = FileFaults(run_at_once, lambda: None)
+    watch.look({}, faults)
+    if not is_there:
+        path.unlink()
+        watch.look({}, faults)
+    before = watch.devices
+
+    def refuse(_path: Path) -> None:
+        raise error
+
+    caplog.set_level("INFO")
+    with monkeypatch.context() as shortage:
+        shortage.setattr(Path, "stat", refuse)
+        changes = [watch.look({}, faults) for _ in range(3)]
+    assert not any(changes)
+    assert watch.devices == before
+    assert [one.message for one in caplog.records].count(
+        f"device file {path}: not checked, so the last state stays "
+        f"({'it is there' if is_there else before[0].missing}): {describe_fault(error)}"
+    ) == 1  # fmt: skip
+
+
+def test_a_slave_without_another_thread_keeps_its_devices(tmp_path, monkeypatch) -> None:
+    """The limit of the user on processes may be used up by others."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("can't start new thread")
+
+    monkeypatch.setattr(threads, "start", refuse)
+    posted: list[Callable[[], None]] = []
+    faults = FileFaults(PathCalls("paths", posted.append).run, lambda: None)
+    watch = DeviceWatch({"camera": (Device("camera", "front", str(tmp_path)),)})
+    for _ in range(3):
+        watch.look({}, faults)
+        while posted:
+            posted.pop()()
+    assert [one.missing for one in watch.devices] == [""]
 
 
 def test_the_devices_of_probes_are_those_of_the_host() -> None:
     """As long as the settings name no unit of their kind."""
     watch = DeviceWatch({"lidar": (Device("lidar", "lidar", shareable=4),)})
-    watch.look({"gpu": (GPU,), "usb": (Device("imu", "x"),)})
+    looked(watch, {"gpu": (GPU,), "usb": (Device("imu", "x"),)})
     assert [one.title for one in watch.devices] == ["lidar", "gpu 0", "imu x"]
 
 
@@ -52,11 +116,11 @@ def test_the_settings_choose_the_units_of_a_kind() -> None:
     """The probe says which of them are there; without a probe of the kind they are taken as is."""
     configured = {"gpu": (Device("gpu", "0"), Device("gpu", "7")), "tpu": ()}
     watch = DeviceWatch(configured)
-    watch.look({"gpu": (GPU, Device("gpu", "1")), "tpu": (Device("tpu", "0"),)})
+    looked(watch, {"gpu": (GPU, Device("gpu", "1")), "tpu": (Device("tpu", "0"),)})
     assert watch.devices == (
         GPU, Device("gpu", "7", missing="no probe finds it; found: 0 and 1"),
     )  # fmt: skip
-    watch.look({})
+    looked(watch)
     assert watch.devices == configured["gpu"]
 
 
@@ -98,7 +162,7 @@ def test_a_device_of_a_subclass_is_copied_as_a_device(tmp_path: Path) -> None:
 
     sampler = sampled(Finder([Camera()]))
     watch = DeviceWatch({})
-    watch.look(sampler.devices)
+    looked(watch, sampler.devices)
     sampler.close()
     assert [one.title for one in watch.devices if one.missing] == ["camera front"]
 
@@ -107,7 +171,7 @@ def test_a_missing_unit_of_a_kind_with_very_many_units_has_a_short_reason() -> N
     """The master would refuse a longer one, with the whole report."""
     units = tuple(Device("gpu", f"{number:064}") for number in range(200))
     watch = DeviceWatch({"gpu": (Device("gpu", "x"),)})
-    watch.look({"finder": units})
+    looked(watch, {"finder": units})
     (missing,) = watch.devices
     assert missing.missing.startswith("no probe finds it; found: 000")
     assert len(missing.missing) < 1000

@@ -19,7 +19,7 @@ class FakeNvml:
     """The part of `pynvml` that the probe uses; for each GPU (percent busy, bytes used, total)."""
 
     class NVMLError(Exception):
-        pass
+        value = 0  # as of the subclass of each error
 
     def __init__(self, *devices):
         self.devices = devices
@@ -27,7 +27,7 @@ class FakeNvml:
         self.drawing = [{} for _ in devices]
         self.shut_down = 0
         self.models = ["NVIDIA X"] * len(devices)
-        self.lost = set()
+        self.errors = {}
 
     def nvmlInit(self):  # noqa: N802 - the driver's name
         return None
@@ -45,8 +45,10 @@ class FakeNvml:
         return self._told(self.models[handle])
 
     def nvmlDeviceGetUUID(self, handle):  # noqa: N802
-        if handle in self.lost:
-            raise self.NVMLError("GPU is lost")
+        if handle in self.errors:
+            error = self.NVMLError(f"code {self.errors[handle]}")
+            error.value = self.errors[handle]
+            raise error
         return f"GPU-{handle}"
 
     def nvmlDeviceGetUtilizationRates(self, handle):  # noqa: N802
@@ -130,13 +132,27 @@ def test_each_gpu_is_a_device_by_its_index():
     assert probe.devices() == [Device("gpu", "1", about=about), Device("gpu", "2", about=about)]
 
 
-def test_a_gpu_with_an_error_of_the_driver_is_missing_until_the_error_is_gone():
+@pytest.mark.parametrize("code", [6, 15, 28], ids=["not found", "lost", "GPU not found"])
+def test_a_gpu_that_the_driver_lost_is_missing_until_it_is_back(code):
     """The other GPUs are still offered."""
     nvml = FakeNvml((0, 0, GIB), (0, 0, GIB))
     probe = GpuProbe(GpuOptions(), nvml)
-    nvml.lost = {1}
-    assert [one.missing for one in probe.devices()] == ["", "NVML: GPU is lost"]
-    nvml.lost = set()
+    nvml.errors = {1: code}
+    assert [one.missing for one in probe.devices()] == ["", f"NVML: code {code}"]
+    nvml.errors = {}
+    assert [one.missing for one in probe.devices()] == ["", ""]
+
+
+@pytest.mark.parametrize("code", [1, 4, 9, 10, 16, 18, 20, 23, 999])
+def test_a_driver_that_cannot_tell_leaves_each_gpu_as_it_was(code):
+    """Otherwise its time-out or lack of memory would end the processes on all GPUs."""
+    nvml = FakeNvml((0, 0, GIB), (0, 0, GIB))
+    probe = GpuProbe(GpuOptions(), nvml)
+    nvml.errors = {1: 15}
+    before = probe.devices()
+    nvml.errors = {0: code, 1: code}
+    assert probe.devices() == before
+    nvml.errors = {}
     assert [one.missing for one in probe.devices()] == ["", ""]
 
 
