@@ -486,7 +486,8 @@ class ProcessTreeLauncher(Protocol):
     """A launcher whose program stays the session leader, as the parent of the process.
 
     The process may have its own session and pid namespace. Each call takes the pid of an instance's
-    session leader, which any launcher may have started.
+    session leader, which any launcher may have started. Raise where the launcher cannot tell; then
+    the members stay as they were.
     """
 
     def leads(self, leader: int) -> bool | None:
@@ -503,7 +504,10 @@ class GraphDepartureLauncher(Protocol):
     """A launcher of nodes that leave the ROS graph for a while."""
 
     def has_departed(self, leader: int) -> bool:
-        """Return True while a node is out of the graph, which pauses its health checks."""
+        """Return True while a node is out of the graph, which pauses its health checks.
+
+        So does a call that is late or raises: raise where the launcher cannot tell.
+        """
 
 
 class ImageLauncher(Protocol):

@@ -56,7 +56,8 @@ class HealthWatch:
         result: Callable[[LookedAt], None],
     ) -> None:  # fmt: skip
         watch = held.watched
-        if watch is not None and not self._launchers.has_departed(held.status.pid):
+        # Where a launcher cannot tell, a silent node may be being moved: that is no observation.
+        if watch is not None and self._launchers.has_departed(held.status.pid) is False:
             look = self._look(instance, held.status.pid, watch, now)
             result(LookedAt(instance, held.status.pid, look))
 

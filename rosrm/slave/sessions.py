@@ -67,7 +67,8 @@ class SessionTable:
         self._members: dict[int, tuple[int, ...]] = {}
         self._groups: dict[int, InstanceGroup] = {}
         self._adopted: set[int] = set()  # leaders in a session of others
-        self._led: set[int] = set()  # leaders that are, or may become, a launcher's program
+        # Leaders that are, or may become, a launcher's program, to the members that it told last.
+        self._led: dict[int, tuple[int, ...]] = {}
         self._pids: tuple[int, ...] = ()
         self._ended_cpu_time = 0.0
         self._usage: dict[int, SessionUsage] = {}
@@ -96,13 +97,13 @@ class SessionTable:
         container = container_of(leader, self._proc)
         if container is not None:
             return (*members, container)
-        if leader not in self._led or not self._launchers.leads(leader):
+        if leader not in self._led:
             return members
-        own = []
+        known = list(members)
         for pid in members:
             with contextlib.suppress(OSError):  # it has ended
-                own.append(inner_pid(pid))
-        return (*members, *own)
+                known.append(inner_pid(pid))
+        return tuple(dict.fromkeys(known))
 
     def add(self, leader: int, group: InstanceGroup | None = None) -> None:
         """Add a session that has begun, by the pid of its leader, who counts at once."""
@@ -112,7 +113,7 @@ class SessionTable:
         with contextlib.suppress(OSError):  # it has ended
             if self._session_of(leader) != leader:
                 self._adopted.add(leader)
-        self._led.add(leader)  # until the next `refresh` asks the launchers
+        self._led[leader] = ()  # until the next `refresh` asks the launchers
         self._collect_pids()
 
     def remove(self, leader: int, cpu_time: float) -> None:
@@ -124,7 +125,7 @@ class SessionTable:
         self._members.pop(leader, None)
         self._groups.pop(leader, None)
         self._adopted.discard(leader)
-        self._led.discard(leader)
+        self._led.pop(leader, None)
         self._usage.pop(leader, None)
         self._cpu_time.pop(leader, None)
         self._collect_pids()
@@ -167,12 +168,13 @@ class SessionTable:
             self._walk(found)
         for leader in self._adopted:
             found[leader] = [leader, *descendants(leader)]
-        for leader in tuple(self._led):
-            leads = self._launchers.leads(leader)
-            if leads:
-                found[leader] = list(self._launchers.members(leader))
-            elif leads is False:
-                self._led.discard(leader)
+        for leader, told in tuple(self._led.items()):
+            members = self._launchers.members(leader)
+            if members is not None and not members:
+                del self._led[leader]
+            elif members or told:  # a launcher that cannot tell leaves the members as they were
+                found[leader] = list(members or told)
+                self._led[leader] = tuple(found[leader])
         self._members = {leader: tuple(pids) for leader, pids in found.items()}
         self._collect_pids()
 

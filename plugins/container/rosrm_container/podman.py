@@ -18,6 +18,7 @@ from typing import Final
 import psutil
 
 from rosrm import Launch, LauncherContext, SkipPlugin
+from rosrm.shortage import raise_shortage
 from rosrm_container import start
 
 #: Seconds for a question to podman; the slave waits for the answer.
@@ -114,7 +115,9 @@ class Podman:
             return None
         try:
             return psutil.Process(int(file.read_text()))
-        except (OSError, ValueError, psutil.Error):
+        except (OSError, ValueError, psutil.Error) as error:
+            if isinstance(error, OSError):
+                raise_shortage(error)
             return None
 
     def _pid_file(self, leader: int) -> Path | None:
@@ -144,10 +147,15 @@ class Podman:
 
 
 def _words(pid: int) -> list[bytes]:
-    """Return the command line; [b""] during an execve, [] if there is no such process."""
+    """Return the command line; [b""] during an execve, [] if there is no such process.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         return Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return []
 
 

@@ -15,6 +15,7 @@ from typing import Final
 from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
 from rosrm.errors import CriuError, LaunchError, PortableError
 from rosrm.ros.names import token
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor.spawn import find_executable
 from rosrm.supervisor.spawn_error import SpawnError
 from rosrm_criu.control.client import directory_of, make_control_root
@@ -94,7 +95,11 @@ class CriuLauncher:
         try:
             control = directory_of(process_tree.root_of(leader))
             status = None if control is None else read_message(control, Status)
-        except (OSError, PortableError):  # it has ended, or cannot be read: treat it like any other
+        except (OSError, PortableError) as error:
+            # It has ended, or wrote no status: treat it like any other, unless no file can be read.
+            for one in (error, error.__cause__):
+                if isinstance(one, OSError):
+                    raise_shortage(one)
             return False
         return status is not None and status.state in (State.LEAVING, State.LEFT, State.JOINING)
 

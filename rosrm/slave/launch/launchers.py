@@ -165,27 +165,32 @@ class Launchers:
         for name, launcher in self._of(ImageLauncher):
             self._ask(name, "discard_images", launcher, None, object, instance)
 
-    def has_departed(self, leader: int) -> bool:
-        """Return True while the node of an instance is out of the ROS graph on purpose."""
-        return any(
-            self._ask(name, "has_departed", launcher, False, bool, leader)
-            for name, launcher in self._of(GraphDepartureLauncher)
-        )
+    def has_departed(self, leader: int) -> bool | None:
+        """Return True while the node of an instance is out of the ROS graph on purpose.
 
-    def leads(self, leader: int) -> bool | None:
-        """Return True if a launcher's program leads the session; None: it may do so in a moment."""
-        answers = {self._leads(name, one, leader) for name, one in self._of(ProcessTreeLauncher)}
+        None: a launcher cannot tell, so the node may be out of the graph.
+        """
+        answers = {
+            self._ask(name, "has_departed", launcher, None, bool, leader)
+            for name, launcher in self._of(GraphDepartureLauncher)
+        }
         return True if True in answers else (None if None in answers else False)
 
-    def members(self, leader: int) -> Sequence[int]:
-        """Return the leader and all processes of the instance that it leads, as far as is known."""
+    def members(self, leader: int) -> Sequence[int] | None:
+        """Return all processes of an instance that a launcher's program leads, the leader first.
+
+        (): no launcher's program leads it. None: a launcher cannot tell, or may lead it soon.
+        """
+        known = True
         for name, launcher in self._of(ProcessTreeLauncher):
-            if self._leads(name, launcher, leader):
-                return self._ask(name, "members", launcher, (leader,), Sequence[int], leader)
-        return (leader,)
+            leads = self._leads(name, launcher, leader)
+            if leads:
+                return self._ask(name, "members", launcher, None, Sequence[int], leader)
+            known = known and leads is not None
+        return () if known else None
 
     def root(self, leader: int) -> int:
-        """Return the pid of the process itself: the leader, if it needs no other program."""
+        """Return the pid of the process itself: the leader, as far as no launcher names another."""
         for name, launcher in self._of(ProcessTreeLauncher):
             if self._leads(name, launcher, leader):
                 return self._ask(name, "root", launcher, leader, int, leader)

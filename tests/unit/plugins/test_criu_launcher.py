@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rosrm.errors import LaunchError
+from rosrm.errors import LaunchError, PortableError
 from rosrm.extensions.contracts import Launch, LauncherContext
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
 from rosrm_criu.launcher import CriuLauncher
+from tests.limits import no_more_files
 
 
 def prepared(
@@ -52,3 +55,27 @@ def test_a_restored_instance_without_an_image_here_is_left_to_other_launchers(tm
     """The image of a process that moves by another strategy may be of another launcher."""
     asked = {"restored": True, "migration": MigrationPolicy("relaunch")}
     assert prepared(tmp_path, **asked) is None
+
+
+def test_a_launcher_without_a_free_descriptor_gives_no_answer(tmp_path):
+    """An answer would end a node that is out of the graph, or forget the processes of a shim."""
+    launcher, own = CriuLauncher(LauncherContext(tmp_path, sys.executable, 1)), os.getpid()
+    for ask in (launcher.has_departed, launcher.leads, launcher.root, launcher.members):
+        with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+            ask(own)
+    assert (launcher.has_departed(own), launcher.leads(own)) == (False, False)
+
+
+def test_a_status_that_cannot_be_read_for_want_of_descriptors_is_unknown(tmp_path, monkeypatch):
+    """The file may say that the node has left the graph."""
+    launcher = CriuLauncher(LauncherContext(tmp_path, sys.executable, 1))
+    monkeypatch.setattr("rosrm_criu.launcher.directory_of", lambda _pid: tmp_path)
+    assert launcher.has_departed(os.getpid()) is False
+
+    def full(*_: object, **__: object) -> int:
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with monkeypatch.context() as shortage:
+        shortage.setattr(os, "open", full)
+        with pytest.raises((OSError, PortableError), match="Too many open files"):
+            launcher.has_departed(os.getpid())

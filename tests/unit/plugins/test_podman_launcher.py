@@ -16,6 +16,7 @@ from rosrm.extensions.contracts import Launch, LauncherContext
 from rosrm.model.values import Assignment, Container, InstanceId, ProcessSpec
 from rosrm_container import start
 from rosrm_container.podman import Podman
+from tests.limits import no_more_files
 
 SPEC = ProcessSpec("p", command=("run", "-v"), container=Container("ros:jazzy", "podman"))
 VARIABLES = {
@@ -101,6 +102,13 @@ def test_a_leader_without_a_command_line_may_run_a_container_soon(launcher) -> N
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
         assert launcher.leads(process.pid) is None
     assert launcher.leads(process.pid) is False
+
+
+def test_without_a_free_descriptor_the_members_of_a_container_are_unknown(launcher) -> None:
+    """Otherwise the slave would forget its processes."""
+    for ask in (launcher.leads, launcher.members, launcher.root):
+        with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+            ask(os.getpid())
 
 
 def test_the_key_of_the_instance_is_mounted_and_in_no_variable(launcher, tmp_path) -> None:

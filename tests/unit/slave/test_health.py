@@ -380,3 +380,12 @@ def test_a_check_that_fails_has_no_result_and_the_others_go_on(monkeypatch, capl
     (result,) = checks.look(held, 1.0)
     assert (result.pid, result.look) == (os.getpid(), Observation(False))
     assert "Too many open files" in caplog.text
+
+
+@pytest.mark.parametrize(("departed", "looks"), [(True, 0), (None, 0), (False, 1)])
+def test_a_node_that_may_be_out_of_the_graph_is_not_observed(departed, looks) -> None:
+    """None: its launcher is late or fails, perhaps while the node is dumped for a move."""
+    launchers = SimpleNamespace(has_departed=lambda _: departed, root=lambda pid: pid)
+    checks = HealthWatch(SimpleNamespace(guard=CallbackGuard()), None, None, launchers)
+    one = SimpleNamespace(status=SimpleNamespace(pid=os.getpid()), watched=Watch(SCAN))
+    assert len(checks.look({InstanceId("p", 1): one}, 1.0)) == looks

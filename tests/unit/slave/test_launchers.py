@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -11,8 +12,11 @@ from rosrm.errors import CriuError, LaunchError
 from rosrm.extensions.contracts import Capabilities, Launch, LauncherOffer, MigrationOffer
 from rosrm.extensions.hookspecs import hookimpl
 from rosrm.extensions.made import MadeLauncher
+from rosrm.extensions.plugin_calls import PluginCalls
+from rosrm.extensions.plugin_deadline import Deadlines
 from rosrm.extensions.registry import Registry
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm.slave import sessions
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
 
@@ -50,11 +54,12 @@ class Restorer(Wrapper):
         return leader == 10
 
 
-class Faulty(Restorer):
-    def _raise(self, *_: Any) -> Any:
-        raise RuntimeError("out of order")
+def out_of_order(*_: Any) -> Any:
+    raise RuntimeError("out of order")
 
-    prepare = discard_images = leads = has_departed = _raise
+
+class Faulty(Restorer):
+    prepare = discard_images = leads = has_departed = out_of_order
 
 
 def launchers(unusable=None, **made: Any) -> Launchers:
@@ -205,14 +210,53 @@ def test_a_launcher_that_fails_leaves_an_instance_as_any_other():
     """The fault of a launcher is recorded once, with its place."""
     known = launchers(ours=Faulty())
     for _ in range(2):
-        assert known.leads(10) is None
-        assert known.members(10) == (10,)
+        assert known.members(10) is None
         assert known.root(10) == 10
     known.discard_images(InstanceId("p", 7))
-    assert not known.has_departed(10)
     ((plugin, error),) = known.calls.changes(0.0)
     assert plugin == ("launcher", "ours")
     assert f"RuntimeError: out of order ({__file__}:" in error
+
+
+@pytest.mark.parametrize("method", ["leads", "members"])
+def test_a_launcher_that_fails_leaves_the_members_as_it_told_them_last(
+    tmp_path, monkeypatch, method
+):
+    """Otherwise its node would be ended as not ready, and its usage would be that of the leader."""
+    launcher = Restorer()
+    table = SessionTable(tmp_path, lambda pid: pid, launchers(ours=launcher))
+    monkeypatch.setattr(sessions, "inner_pid", lambda pid: pid + 100)
+    table.add(10)
+    table.refresh(0.0)
+    with monkeypatch.context() as fault:
+        fault.setattr(launcher, method, out_of_order)
+        for now in (1.0, 2.0):
+            table.refresh(now)
+            assert table.known_as(10) == (10, 11, 12, 110, 111, 112)
+    monkeypatch.setattr(launcher, "leads", lambda _leader: False)
+    table.refresh(3.0)
+    assert table.known_as(10) == (10,)
+
+
+def test_a_launcher_that_cannot_tell_whether_a_node_has_departed_gives_no_answer():
+    """Its node may be out of the graph while its memory is dumped: it is not unhealthy then."""
+    calls = PluginCalls(Deadlines(0.05))
+    calm = Restorer()
+
+    class Late(Restorer):
+        def has_departed(self, leader):
+            time.sleep(0.1)
+            return False
+
+    late = replace(launchers(late=Late(), calm=calm), calls=calls)
+    assert late.has_departed(30) is None, "late"
+    assert late.has_departed(30) is None, "paused"
+    assert late.has_departed(10) is True, "another launcher knows"
+    for wrong in (out_of_order, lambda _leader: None, lambda _leader: "no"):
+        faulty = Restorer()
+        faulty.has_departed = wrong
+        assert launchers(ours=faulty, calm=calm).has_departed(30) is None
+    assert launchers(calm=calm).has_departed(30) is False
 
 
 # --- of plugins ------------------------------------------------------------------------------

@@ -123,7 +123,7 @@ def read_message(directory: Path, kind: type[_Content]) -> _Content | None:
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
-        raise PortableError(f"{path} cannot be read: {reason_of(error)}") from None
+        raise PortableError(f"{path} cannot be read: {reason_of(error)}") from error
     try:
         found = json.loads(data)
     except (ValueError, RecursionError):

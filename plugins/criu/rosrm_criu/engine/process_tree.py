@@ -11,6 +11,7 @@ from typing import Final
 
 from rosrm import clocks
 from rosrm.runtime import signalling
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor.procfs import everyone, inner_pid, read_stat
 
 #: Namespaces that CRIU must share with the process that it dumps, each with its nsenter option.
@@ -84,10 +85,15 @@ def _names(words: Sequence[str], program: str) -> bool:
 
 
 def _words(pid: int) -> list[str]:
-    """Return the command line; [""] in the middle of an execve, [] if there is no such process."""
+    """Return the command line; [""] in the middle of an execve, [] if there is no such process.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         return os.fsdecode(Path(f"/proc/{pid}/cmdline").read_bytes()).split("\0")
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return []
 
 
