@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from functools import cached_property
 from typing import Any, Final, Literal, get_args, get_type_hints
 
 from rosrm.config.checking import near, validated
 from rosrm.config.documents import Node, Problems
 from rosrm.errors import ConfigError, PluginError
-from rosrm.extensions.declared_fields import container_conflict, no_standby
+from rosrm.extensions.contracts import Capabilities
+from rosrm.extensions.declared_fields import (
+    MaybeCapabilities,
+    container_conflict,
+    no_capabilities,
+    standby_conflict,
+)
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import TITLES
 from rosrm.extensions.registry import Registry
@@ -46,21 +53,25 @@ class PluginCheck:
 
     def standby_fault(self, spec: ProcessSpec) -> str:
         """Return why a process cannot have its requested standby; "": no reason is known."""
-        strategy = spec.migration.strategy
-        if not spec.standby.wanted or (strategy and self._registry is None):
-            return ""
-        known = {} if self._registry is None else self._registry.capabilities()
-        if strategy and strategy not in known:
-            return ""  # `choice` has noted that it is not installed
-        if self._registry is not None and self._registry.capabilities_of()(spec).shadow:
-            return ""
-        return no_standby(strategy, known)
+        able = self._capabilities(spec)
+        return "" if able is None else standby_conflict(spec, able, self._known)
 
     def container_fault(self, spec: ProcessSpec) -> str:
         """Return why a process in a container cannot move by its strategy; "": it can."""
-        if self._registry is None or spec.migration.strategy is None:
-            return ""
-        return container_conflict(spec, self._registry.capabilities_of()(spec))
+        able = self._capabilities(spec)
+        return "" if able is None else container_conflict(spec, able)
+
+    def _capabilities(self, spec: ProcessSpec) -> MaybeCapabilities | None:
+        """Return the capabilities of a process; None: the strategy cannot be checked here."""
+        if spec.migration.strategy is None:
+            return no_capabilities(spec)
+        if self._registry is None or not self.has("migration", spec.migration.strategy):
+            return None  # `choice` has noted that it is not installed
+        return self._registry.capabilities_of()(spec)
+
+    @cached_property
+    def _known(self) -> Mapping[str, Capabilities]:
+        return {} if self._registry is None else self._registry.capabilities()
 
     def choice(
         self, kind: PluginKind, name: str, named: Node, options: Node | None, *,

@@ -112,6 +112,28 @@ def _may_change(hint: Any) -> bool:
     return any(map(_may_change, get_args(hint)))
 
 
+@dataclass(frozen=True, slots=True)
+class UnknownCapabilities:
+    """A strategy has not told its capabilities for a process, which may have state or a launcher.
+
+    Attributes:
+        reason: a sentence.
+    """
+
+    reason: str
+
+
+def unknown_capabilities(strategy: str, why: object) -> UnknownCapabilities:
+    """Return the value for a strategy that gives no answer."""
+    return UnknownCapabilities(
+        f"the capabilities of its migration strategy {strategy!r} are not known: {why}"
+    )
+
+
+#: Capabilities of a strategy for one process, if they are known.
+MaybeCapabilities = Capabilities | UnknownCapabilities
+
+
 def no_options(_strategy: str, _spec: ProcessSpec) -> Any:
     """Return None, because no offer declares the options of a strategy."""
     return None
@@ -122,17 +144,37 @@ def no_capabilities(_spec: ProcessSpec) -> Capabilities:
     return Capabilities()
 
 
-def no_standby(strategy: str | None, known: Mapping[str, Capabilities]) -> str:
-    """Return why a process can have no standby, and the known strategies that support one."""
+def standby_conflict(
+    spec: ProcessSpec, able: MaybeCapabilities, known: Mapping[str, Capabilities]
+) -> str:
+    """Return why a process cannot have its standby; "": it can, or requests none.
+
+    Args:
+        spec: of the process.
+        able: capabilities of its strategy.
+        known: those of all strategies, for the remedy.
+    """
+    if not spec.standby.wanted:
+        return ""
+    if isinstance(able, UnknownCapabilities):
+        return able.reason
+    return "" if able.shadow else _no_standby(spec.migration.strategy, known)
+
+
+def _no_standby(strategy: str | None, known: Mapping[str, Capabilities]) -> str:
     able = [f"`migration: {name}`" for name, it in known.items() if it.shadow]
     why = f"{strategy} has no standby" if strategy else "no migration strategy is given"
     remedy = f"write {listed(able, 'or')}" if able else "install a strategy with standbys"
     return f"a standby needs a migration strategy that copies state, and {why}: {remedy}"
 
 
-def container_conflict(spec: ProcessSpec, able: Capabilities) -> str:
+def container_conflict(spec: ProcessSpec, able: MaybeCapabilities) -> str:
     """Return why a process in a container cannot move by a strategy; "": it can, or has none."""
-    if not spec.container.image or (able.state == "none" and not able.launcher):
+    if not spec.container.image:
+        return ""
+    if isinstance(able, UnknownCapabilities):
+        return able.reason
+    if able.state == "none" and not able.launcher:
         return ""
     return (
         f"{spec.migration.strategy} moves the state of a process, which is not possible with a "
@@ -151,15 +193,21 @@ class Declared:
         brought_by: strategy to its distribution, if known.
         capabilities_of: returns the capabilities of the strategy of a process; never raises.
         capabilities: each installed strategy, selected or not, to its capabilities with the options
-            of the cluster.
+            of the cluster, if they are known.
     """
 
     options_of: Callable[[str, ProcessSpec], Any] = no_options
     executors: Mapping[str, frozenset[str]] = field(default_factory=lambda: EMPTY)
     brought_by: Mapping[str, str] = field(default_factory=lambda: EMPTY)
-    capabilities_of: Callable[[ProcessSpec], Capabilities] = no_capabilities
+    capabilities_of: Callable[[ProcessSpec], MaybeCapabilities] = no_capabilities
     capabilities: Mapping[str, Capabilities] = field(default_factory=lambda: EMPTY)
 
-    def has_snapshots(self, spec: ProcessSpec) -> bool:
-        """Return True if the node of a process publishes state that is stored in snapshots."""
-        return bool(spec.ros) and self.capabilities_of(spec).state == "topics"
+    def may_have_snapshots(self, spec: ProcessSpec) -> bool:
+        """Return False if the node of a process publishes no state that is stored in snapshots.
+
+        With unknown capabilities it may: what is done for snapshots that do not exist does no harm.
+        """
+        if not spec.ros:
+            return False
+        able = self.capabilities_of(spec)
+        return isinstance(able, UnknownCapabilities) or able.state == "topics"

@@ -32,7 +32,11 @@ from rosrm.extensions.contracts import (
     ScoringOffer,
     ScoringPolicy,
 )
-from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.declared_fields import (
+    Declared,
+    MaybeCapabilities,
+    unknown_capabilities,
+)
 from rosrm.extensions.discovery import (
     Broken,
     ChosenOffer,
@@ -94,6 +98,8 @@ SLAVE_KINDS: Final[tuple[PluginKind, ...]] = ("probe", "migration", "launcher")
 _MOST_BROKEN: Final = 3
 
 _NO_CAPABILITIES: Final = Capabilities()
+#: Most answers on capabilities in memory, because each process may have options of its own.
+_MOST_ANSWERS: Final = 10_000
 
 _log = logging.getLogger("rosrm.plugins")
 
@@ -294,32 +300,44 @@ class Registry:
         return options
 
     def capabilities(self, chosen: NameToOptions = EMPTY) -> dict[str, Capabilities]:
-        """Return the capabilities of each installed strategy for a process without own options."""
+        """Return the known capabilities of each installed strategy, without a process's options."""
         of = self.capabilities_of(chosen)
         names = self.names("migration")
-        return {name: of(ProcessSpec("", migration=MigrationPolicy(name))) for name in names}
+        found = {name: of(ProcessSpec("", migration=MigrationPolicy(name))) for name in names}
+        return {name: able for name, able in found.items() if isinstance(able, Capabilities)}
 
     def capabilities_of(
         self, chosen: NameToOptions = EMPTY
-    ) -> Callable[[ProcessSpec], Capabilities]:
+    ) -> Callable[[ProcessSpec], MaybeCapabilities]:
         """Return a function that returns the capabilities of the strategy of a process.
 
-        A strategy that is not installed here has no capabilities. A strategy that fails has those
-        of its last answer, or none.
+        A strategy is asked until it answers, once for the same options. Its capabilities are
+        unknown until then, and where it is not installed.
 
         Args:
             chosen: strategies with their options for all processes.
         """
         found = self.capabilities_or_fault(chosen)
-        last: dict[str, Capabilities] = {}
+        answers: dict[tuple[str, str], Capabilities] = {}
 
-        def known(spec: ProcessSpec) -> Capabilities:
-            name = spec.migration.strategy or ""
-            try:
-                last[name] = found(spec)
-            except PluginError:  # the guard has recorded it
-                return last.get(name, _NO_CAPABILITIES)
-            return last[name]
+        def known(spec: ProcessSpec) -> MaybeCapabilities:
+            name = spec.migration.strategy
+            if name is None:
+                return _NO_CAPABILITIES
+            if ("migration", name) not in self._offers:
+                return unknown_capabilities(
+                    name, f"{name!r} is not installed here: install it and start the master again"
+                )
+            key = name, repr(spec.migration.options)
+            if key not in answers:
+                try:
+                    answer = found(spec)
+                except PluginError as fault:  # the guard has recorded it
+                    return unknown_capabilities(name, fault)
+                if len(answers) >= _MOST_ANSWERS:
+                    del answers[next(iter(answers))]
+                answers[key] = answer
+            return answers[key]
 
         return known
 
@@ -328,7 +346,8 @@ class Registry:
     ) -> Callable[[ProcessSpec], Capabilities]:
         """Return a function as `capabilities_of`, which raises `PluginError` if a strategy fails.
 
-        A start needs it, because without its launcher the process would be another one.
+        A start needs it, because without its launcher the process would be another one. A host
+        that lacks the strategy of a process has none of its launchers either.
         """
         options = self._options(chosen)
 

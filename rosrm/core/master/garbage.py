@@ -52,7 +52,7 @@ def remove_process(state: MasterState, name: str) -> None:
     state.replication.last_orders.pop(name, None)
     process = state.processes.pop(name)
     state.ledger.remove(process.principal, process_key(name))
-    if state.declared.has_snapshots(process.spec):
+    if state.declared.may_have_snapshots(process.spec):
         _note_removed(state, name)
     state.unsaved.processes.pop(name, None)
     state.emit(Intent("process", name, None))

@@ -48,7 +48,7 @@ from rosrm.core.master.state.replicas import ReplicationState
 from rosrm.core.master.state.start_orders import StartOrders
 from rosrm.core.newest import Newest
 from rosrm.extensions.contracts import MigrationStrategy
-from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.declared_fields import Declared, UnknownCapabilities
 from rosrm.extensions.placement import ChainOf, PlacementPlugins, PolicySettings
 from rosrm.model.devices import HeldDevice
 from rosrm.model.event_kinds import EventKind
@@ -507,7 +507,8 @@ class MasterState:
     def _put_in_queue(self, process: Process) -> None:
         self.queue.add(process.name, process.spec.priority, process.order)
         self.start_orders.note_change(process.name)
-        if process.name in self.strays:
+        able = self.declared.capabilities_of(process.spec)
+        if process.name in self.strays or isinstance(able, UnknownCapabilities):
             self.start_orders.to_review[process.name] = None
         if process.queue_delay:
             self.queue.delayed.add(process.name)
@@ -711,7 +712,7 @@ class MasterState:
         known = self.instances.get(instance.number)
         snapshot_hosts: tuple[str, ...] = ()
         snapshots_from = 0
-        if self.declared.has_snapshots(spec):
+        if self.declared.may_have_snapshots(spec):
             process = self.processes[spec.name]
             snapshots_from = max(1, process.born)  # 0: no snapshots
             if not shadow and not restored:

@@ -37,7 +37,7 @@ from rosrm.core.master.state.process import WAITING, DesiredState, Process, Proc
 from rosrm.core.master.stores import check_number, check_store, make_room
 from rosrm.errors import PluginError, plain_text
 from rosrm.extensions.contracts import SpecChecking
-from rosrm.extensions.declared_fields import container_conflict, no_standby, unshared
+from rosrm.extensions.declared_fields import container_conflict, standby_conflict, unshared
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.adoption_rules import adoption_fault
 from rosrm.model.event_kinds import EventKind
@@ -239,11 +239,9 @@ def _spec_fault(state: MasterState, spec: ProcessSpec) -> str:
     fault = _strategy_fault(state, spec)
     if fault:
         return f"migration by {strategy!r}: {fault}"
-    if spec.standby.wanted and not state.declared.capabilities_of(spec).shadow:
-        return no_standby(strategy, state.declared.capabilities)
-    if not spec.container.image:
-        return ""
-    return container_conflict(spec, state.declared.capabilities_of(spec))
+    able = state.declared.capabilities_of(spec)
+    standby_fault = standby_conflict(spec, able, state.declared.capabilities)
+    return standby_fault or container_conflict(spec, able)
 
 
 #: Paths of the fields that `_spec_fault` checks.

@@ -3,8 +3,9 @@
 =============================  ====================================================================
 process                        action, when a dependency or a dependant of it has changed
 =============================  ====================================================================
-in the queue                   may be placed once all conditions hold and the delay is over; until
-                               then it blocks no other process, and its reason names what it awaits
+in the queue                   may be placed once all conditions hold, the delay is over and the
+                               capabilities of its strategy are known; until then it blocks no other
+                               process, and its reason names what it awaits
 running, `on_restart`          is restarted in place once all conditions hold again, if a dependency
                                was started or restarted after it
 cancelled, with dependants     is ordered to stop once its cancelled dependants have ended
@@ -24,6 +25,7 @@ from rosrm.core.master import lifecycle, restarts
 from rosrm.core.master.dependants import awaited_ends, waits_for_ends
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.extensions.declared_fields import UnknownCapabilities
 from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
 from rosrm.model.description_checks import other_process_fault
 from rosrm.model.event_kinds import EventKind
@@ -32,6 +34,8 @@ from rosrm.wording import listed, no_such, standing
 
 #: Seconds beyond the time-out of the stop of a dependant, after which its end is not awaited.
 _PATIENCE: Final = 30.0
+#: Seconds until a strategy is asked again for the capabilities that it has not told.
+_ASK_EVERY: Final = 1.0
 #: Phases of a dependency that it leaves only by a request, or when its host returns.
 _NEEDS_HELP: Final = (
     ProcessPhase.SET_ASIDE, ProcessPhase.UNREACHABLE, ProcessPhase.STUCK, ProcessPhase.CHECKPOINTED,
@@ -62,7 +66,11 @@ def review(state: MasterState, now: float) -> None:
 def _review_waiting(state: MasterState, process: Process, now: float) -> None:
     """Let a queued process wait for its dependencies, or be placed."""
     name = process.name
-    reason = _awaited_strays(state, process, now) or _awaited(state, process, now)
+    reason = (
+        _awaited_strays(state, process, now)
+        or _awaited(state, process, now)
+        or _awaited_capabilities(state, process, now)
+    )
     if reason and process.reason != reason:
         state.record(now, EventKind.WAITS, f"{name} {reason}", process=name)
     if reason or name in state.queue.awaiting:
@@ -87,6 +95,18 @@ def _awaited_strays(state: MasterState, process: Process, now: float) -> str:
     strays = [state.instances[number] for number in sorted(numbers)]
     have = "has" if len(strays) == 1 else "have"
     return f"waits until {listed(f'{one.id} on {one.host.name}' for one in strays)} {have} ended"
+
+
+def _awaited_capabilities(state: MasterState, process: Process, now: float) -> str:
+    """Return why a process waits until its strategy tells its capabilities; "": it has done so.
+
+    A start without them might be one without the state of the process.
+    """
+    able = state.declared.capabilities_of(process.spec)
+    if not isinstance(able, UnknownCapabilities):
+        return ""
+    state.start_orders.set_delay(process.name, now + _ASK_EVERY)
+    return f"waits: {able.reason}"
 
 
 def _awaited(state: MasterState, process: Process, now: float) -> str:

@@ -29,8 +29,8 @@ from rosrm.core.master.recovery.restore import restore
 from rosrm.core.master.settings import CoreSettings
 from rosrm.core.master.state.process import Process
 from rosrm.core.slave import events
-from rosrm.extensions.contracts import HostView, ProcessView, Scores
-from rosrm.extensions.declared_fields import Declared
+from rosrm.extensions.contracts import Capabilities, HostView, ProcessView, Scores
+from rosrm.extensions.declared_fields import Declared, MaybeCapabilities
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.placement import PlacementPlugins, ScoringLink, SelectedFilter
 from rosrm.extensions.registry import Registry
@@ -171,6 +171,7 @@ OrderT = TypeVar("OrderT", bound=Order)
 
 _REGISTRY = Registry.of(migration=rosrm_migration.plugin, criu=rosrm_criu.plugin)
 _SHIPPED = {name: _REGISTRY.offer("migration", name) for name in _REGISTRY.names("migration")}
+_REGISTRY.calls.limit = lambda _, call: call()  # a busy machine must not change what happens
 _CAPABILITIES, _CAPABILITIES_OF = _REGISTRY.capabilities(), _REGISTRY.capabilities_of()
 
 
@@ -185,8 +186,12 @@ def declared_by(strategies: Mapping[str, Any]) -> Declared:
         own = spec.migration.options if spec.migration.strategy == name else {}
         return merged_options(offer.own_options or offer.options, to_plain(cluster), own)
 
+    def capabilities_of(spec: ProcessSpec) -> MaybeCapabilities:
+        is_shipped = spec.migration.strategy in (None, *_SHIPPED)
+        return _CAPABILITIES_OF(spec) if is_shipped else Capabilities()
+
     return Declared(
-        options_of=options_of, capabilities_of=_CAPABILITIES_OF, capabilities=_CAPABILITIES
+        options_of=options_of, capabilities_of=capabilities_of, capabilities=_CAPABILITIES
     )
 
 

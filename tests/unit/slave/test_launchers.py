@@ -281,7 +281,7 @@ def test_a_plugin_brings_a_launcher_that_its_strategy_declares():
     """The registry lists the launcher like any other offer."""
     known = registry(lambda context: Wrapper())
     made = known.launchers(None).made
-    own = Launchers(made, {}, known.capabilities_of())
+    own = Launchers(made, {}, known.capabilities_or_fault())
     assert own.prepare(launch("moves")).argv == ("wrap", "x")
     assert own.variables == ("OURS",)
     assert [(row.name, row.state) for row in known.rows("launcher")] == [("ours", "selected")]

@@ -26,6 +26,7 @@ from rosrm.core.master.scheduling.decision import decide
 from rosrm.core.master.scheduling.feasibility import why_never
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.extensions.declared_fields import UnknownCapabilities
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import ProcessSpec
 
@@ -49,7 +50,10 @@ def try_replace(
     """
     if process.name in state.migrations:
         return Busy(why_busy(state.migrations[process.name]))
-    kept = state.declared.capabilities_of(spec).state
+    able = state.declared.capabilities_of(spec)
+    if isinstance(able, UnknownCapabilities):
+        return Rejected(able.reason)
+    kept = able.state
     strategy = spec.migration.strategy
     can_move = strategy in state.strategies and kept != "memory"  # an image has the old program
     never = why_never(state.hosts, _demand(state, process, spec, process.forbidden_hosts))

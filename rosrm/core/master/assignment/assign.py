@@ -213,7 +213,10 @@ def _passed_over(state: MasterState, now: float) -> frozenset[str]:
     delayed = _delayed(state, now)
     if not state.hosts.any_having(_AWAY):
         return delayed
-    names = [name for name in state.queue if awaits_states(state, state.processes[name], now)]
+    names = [
+        name for name in state.queue
+        if name not in state.queue.awaiting and awaits_states(state, state.processes[name], now)
+    ]  # fmt: skip
     for name in names:
         _record_wait_reason(state, state.processes[name], _AWAITS_SNAPSHOT, now)
     return delayed.union(names)

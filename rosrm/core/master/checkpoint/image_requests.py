@@ -29,6 +29,7 @@ from rosrm.core.master.scheduling.ranking import Ranking
 from rosrm.core.master.state.migration import Migration
 from rosrm.core.master.state.process import DesiredState, Image, Instance, Process, ProcessPhase
 from rosrm.extensions.contracts import Imaging
+from rosrm.extensions.declared_fields import UnknownCapabilities
 from rosrm.extensions.plugin_calls import implements
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import Aim, Commit, Execute, Move
@@ -87,7 +88,10 @@ def _why_not_dumped(state: MasterState, process: Process) -> str:
             f"{process.name} has a standby, which would take over: submit the process without "
             f"`standby` to checkpoint it"
         )
-    if state.declared.has_snapshots(process.spec):
+    able = state.declared.capabilities_of(process.spec)
+    if isinstance(able, UnknownCapabilities) and process.spec.ros:
+        return f"{process.name} cannot be checkpointed: {able.reason}"
+    if state.declared.may_have_snapshots(process.spec):
         return (
             f"{process.name} moves by {process.spec.migration.strategy}: its node is identified by "
             f"the number of its instance, and the restored instance would have another one"

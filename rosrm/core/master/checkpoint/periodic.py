@@ -31,7 +31,7 @@ from rosrm.core.master.state.periodic import Dumped
 from rosrm.core.master.state.process import Instance, Process, ProcessPhase
 from rosrm.errors import PluginError
 from rosrm.extensions.contracts import MemoryPacing, MemoryView, PeriodicImaging
-from rosrm.extensions.declared_fields import unshared
+from rosrm.extensions.declared_fields import UnknownCapabilities, unshared
 from rosrm.extensions.plugin_calls import implements, required
 from rosrm.model.codec import checked
 from rosrm.model.event_kinds import EventKind
@@ -58,7 +58,8 @@ def review(state: MasterState, now: float) -> None:
             del known.of[number]
     if any(implements(one, PeriodicImaging) for one in state.strategies.values()):
         for process in state.processes.values():
-            if state.declared.capabilities_of(process.spec).restart_from_image:
+            able = state.declared.capabilities_of(process.spec)
+            if not isinstance(able, UnknownCapabilities) and able.restart_from_image:
                 _review(state, process, now)
 
 

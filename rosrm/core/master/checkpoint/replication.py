@@ -84,7 +84,7 @@ def awaits_states(state: MasterState, process: Process, now: float) -> bool:
     other than its own, if only snapshots of earlier instances are in reach, or none: an earlier
     instance that ran on in a partition has another state than its successor.
     """
-    if not state.declared.has_snapshots(process.spec):
+    if not state.declared.may_have_snapshots(process.spec):
         return False
     if (state.hosts.condition == HostCondition.EXPECTED).any():
         return True

@@ -18,7 +18,7 @@ class Queue:
         version: counter of changes.
         delayed: names in it that wait for the end of their delay.
         arrays: jobs that wait outside of it, because their array has no place for them.
-        awaiting: names in it that wait for other processes to start or finish.
+        awaiting: names in it that wait for other processes, or for an answer of their strategy.
     """
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class Queue:
                 of.add(name)
 
     def set_awaiting(self, name: str, *, awaiting: bool) -> None:
-        """Note whether a process in the queue waits for other processes to start or finish."""
+        """Note whether a process in the queue waits for something other than its placement."""
         if awaiting != (name in self.awaiting):
             self.awaiting.symmetric_difference_update({name})
             self.version += 1
