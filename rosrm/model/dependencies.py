@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from graphlib import CycleError, TopologicalSorter
 
 from rosrm.model.values import Kind, ProcessSpec, StartCondition
@@ -22,6 +23,25 @@ def circle_in(after: Mapping[str, Iterable[str]]) -> Sequence[str]:
     except CycleError as error:
         return tuple(reversed(error.args[1]))
     return ()
+
+
+def in_order(after: Mapping[str, Iterable[str]]) -> list[str]:
+    """Return the processes, each one behind those after which it comes.
+
+    Those of a circle, and those behind it, are the last. No circle may come into force, but the
+    journal of an older master may have one, which must not end each master that reads it.
+
+    Args:
+        after: as in `circle_in`.
+    """
+    sorter, found = TopologicalSorter(after), list[str]()
+    with suppress(CycleError):  # the sorter still yields what is in no circle
+        sorter.prepare()
+    while sorter.is_active():
+        ready = sorter.get_ready()
+        sorter.done(*ready)
+        found += ready
+    return list(dict.fromkeys((*found, *after)))
 
 
 def condition_fault(dependency: ProcessSpec, condition: StartCondition) -> str:

@@ -7,11 +7,12 @@ the desired states alone, so that it also holds after a restart of the master.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from graphlib import TopologicalSorter
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.rights import may_affect
 from rosrm.core.master.state.process import DesiredState, Process
+from rosrm.model.dependencies import circle_fault, circle_in, in_order
+from rosrm.model.values import ProcessSpec
 from rosrm.wording import listed
 
 
@@ -35,7 +36,45 @@ def dependants_first(state: MasterState, processes: Sequence[Process]) -> list[P
     before = {name: [one for one in dependants.get(name, ()) if one in named] for name in named}
     if not any(before.values()):
         return list(processes)
-    return [named[name] for name in TopologicalSorter(before).static_order()]
+    return [named[name] for name in in_order(before)]
+
+
+def orders_from(state: MasterState, starting: Sequence[ProcessSpec]) -> dict[str, Sequence[str]]:
+    """Return the dependencies of processes, and of all after which they start.
+
+    Of a process that is not among `starting`, each order that is in force or comes into force
+    without a further request counts.
+    """
+    given = {spec.name: [spec] for spec in starting}
+    pending = {
+        name: application.specs[name]
+        for application in state.applications.values()
+        for name in application.tasks
+        if name in application.specs
+    }
+    names, found = list(given), dict[str, Sequence[str]]()
+    for name in names:  # they become more
+        if name not in found:
+            specs = given.get(name) or _specs_of(state, name, pending.get(name))
+            found[name] = list(
+                dict.fromkeys(one for spec in specs for one in spec.start_order.after)
+            )
+            names += found[name]
+    return found
+
+
+def _specs_of(state: MasterState, name: str, pending: ProcessSpec | None) -> list[ProcessSpec]:
+    """Return the specs of a process that are or may be in force; `pending`: that of its task."""
+    process = state.processes.get(name)
+    is_live = process is not None and not process.phase.is_terminal
+    own = (process.spec, state.spec_to_be(process)) if process is not None and is_live else ()
+    return [*own, *([pending] if pending is not None else [])]
+
+
+def circle_from(state: MasterState, starting: Sequence[ProcessSpec]) -> str:
+    """Return a sentence on a circle that processes with these start orders close; "": none."""
+    circle = circle_in(orders_from(state, starting))
+    return circle_fault(circle) if circle else ""
 
 
 def binding_dependants(state: MasterState, process: Process) -> list[str]:

@@ -17,16 +17,16 @@ nor in a migration. Nothing is journaled but specs, phases, desired states and `
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from math import inf
 from typing import Final
 
 from rosrm.core.master import lifecycle, restarts
-from rosrm.core.master.dependants import awaited_ends, waits_for_ends
+from rosrm.core.master.dependants import awaited_ends, circle_from, waits_for_ends
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.extensions.declared_fields import UnknownCapabilities
-from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
+from rosrm.model.dependencies import circle_in, condition_fault
 from rosrm.model.description_checks import other_process_fault
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.values import InstanceState, Kind, ProcessSpec, StartCondition
@@ -188,10 +188,11 @@ def _review_stop(state: MasterState, process: Process, now: float) -> None:
 def review_stops(state: MasterState, now: float) -> None:
     """Stop each cancelled process whose dependants do not end in time."""
     orders = state.start_orders
+    ends = {name: awaited_ends(state, state.processes[name]) for name in orders.last_to_stop}
+    circle = circle_in(ends)  # of an older journal: each of them waits in turn, without an end
     for name, since in list(orders.last_to_stop.items()):
-        process = state.processes[name]
-        awaited = awaited_ends(state, process)
-        if not orders.last_to_stop.keys().isdisjoint(awaited):
+        process, awaited = state.processes[name], ends[name]
+        if name not in circle and not ends.keys().isdisjoint(awaited):
             continue  # one of them waits in turn
         longest = max((state.processes[one].spec.stop.timeout for one in awaited), default=0.0)
         owner = state.owner_of(process)
@@ -228,8 +229,7 @@ def start_order_fault(state: MasterState, starting: Sequence[ProcessSpec]) -> st
             fault = fault or _dependency_fault(state, known, name, condition)
             if fault:
                 return f"{spec.name}: after: {fault}"
-    circle = circle_in(dict(_reachable(state, specs)))
-    return circle_fault(circle) if circle else ""
+    return circle_from(state, starting)
 
 
 def _dependency_fault(
@@ -247,16 +247,3 @@ def _dependency_fault(
         return ""
     ends = process.wanted is DesiredState.CANCEL or process.phase.is_terminal
     return _obstacle(state, name) if ends else ""
-
-
-def _reachable(
-    state: MasterState, specs: Mapping[str, ProcessSpec]
-) -> Iterator[tuple[str, Sequence[str]]]:
-    """Yield each of the processes, and those after which they start, with its dependencies."""
-    names, seen = list(specs), set[str]()
-    for name in names:  # they become more
-        order = specs[name].start_order if name in specs else state.start_orders.declared.get(name)
-        if name not in seen and order is not None:
-            seen.add(name)
-            yield name, list(order.after)
-            names += order.after

@@ -39,7 +39,7 @@ from rosrm.core.master.applications.listing import described, unwell_processes
 from rosrm.core.master.applications.replacement import Busy, NeverFits, try_replace
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.cancellation import cancel
-from rosrm.core.master.dependants import dependants_first
+from rosrm.core.master.dependants import circle_from, dependants_first
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import add_process, still_stopping
 from rosrm.core.master.schedules import change_between_runs
@@ -318,15 +318,31 @@ def _handle_fault(
             behind.note(now, *_WAITS)
             application.behind[name] = behind
         _note(state, application, now, EventKind.APPLICATION_FAILED, f"is degraded: {why}")
-    elif version.rollout.on_failure == "pause":
+        return
+    cancelled = frozenset(filter(partial(_stays_cancelled, state, application), version.specs))
+    pauses = version.rollout.on_failure == "pause"
+    circle = "" if pauses else _circle_of_return(state, application, cancelled)
+    if pauses or circle:
+        why += circle and f"; the former version {application.former} does not return: {circle}"
         application.paused = why
         _note(state, application, now, EventKind.APPLICATION_FAILED, f"is paused: {why}")
     else:
         message = f"returns from version {version.number} to {application.former}: {why}"
         _note(state, application, now, EventKind.APPLICATION_RETURNS, message)
         state.save_version(application, replace(version, given_up=why))
-        cancelled = frozenset(filter(partial(_stays_cancelled, state, application), version.specs))
         _set_wanted(state, application, application.former, now, former=0, stay_cancelled=cancelled)
+
+
+def _circle_of_return(
+    state: MasterState, application: Application, stay_cancelled: AbstractSet[str]
+) -> str:
+    """Return a sentence on a circle of start orders that the former version would close; "": none.
+
+    Other applications may have changed since that version was checked.
+    """
+    former = application.versions.get(application.former)
+    specs = former.specs.values() if former is not None else ()
+    return circle_from(state, [spec for spec in specs if spec.name not in stay_cancelled])
 
 
 def _is_cancelled(state: MasterState, name: str) -> bool:
