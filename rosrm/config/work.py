@@ -32,6 +32,7 @@ from rosrm.extensions.registry import Registry
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.model.contradictions import contradiction_in
 from rosrm.model.dependencies import circle_fault, circle_in, condition_fault
+from rosrm.model.gang_rules import gang_array_fault, gang_order_fault
 from rosrm.model.placeholders import ARTIFACTS
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import get_close_matches
@@ -254,9 +255,13 @@ def _refuse_contradictions(
             fault = condition_fault(known[name], condition) if name in known else ""
             if fault:
                 problems.add(places[spec.name].deepest(("after", name)).place, f"after: {fault}")
-    circle = circle_in({name: list(spec.start_order.after) for name, spec in known.items()})
+    after = {name: list(spec.start_order.after) for name, spec in known.items()}
+    gang_of = {name: ("", spec.together) for name, spec in known.items() if spec.together}
+    circle = circle_in(after)
     if circle:
         problems.add(places[circle[0]].deepest(("after", circle[1])).place, circle_fault(circle))
+    elif gang := gang_array_fault(gang_of, known) or gang_order_fault(gang_of, after):
+        problems.add(places[gang.process].deepest(gang.path).place, gang.text)
     fault = contradiction_in(known) if any(spec.neighbours for spec in known.values()) else ""
     if fault:
         problems.add(places[fault.partition(" ")[0].rstrip(":")].place, fault)

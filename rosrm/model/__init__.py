@@ -36,6 +36,7 @@ component_rules.py      rules for the components that a slave loads into a conta
 lifecycle_rules.py      rules for processes whose slave changes their lifecycle state
 secret_rules.py         rules for the secrets of a process
 dependencies.py         rules on processes that start after each other
+gang_rules.py           rules on gangs that can never start
 contradictions.py       contradictions between rules on neighbours
 description_checks.py   checks of the description of a host, and of names
 """

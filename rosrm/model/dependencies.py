@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from graphlib import CycleError, TopologicalSorter
+from typing import TypeVar
 
 from rosrm.model.values import Kind, ProcessSpec, StartCondition
 
+Name = TypeVar("Name", bound=Hashable)
 
-def circle_in(after: Mapping[str, Iterable[str]]) -> Sequence[str]:
+
+def circle_in(after: Mapping[Name, Iterable[Name]]) -> Sequence[Name]:
     """Return a circle of processes, each of which starts after the next one; (): there is none.
 
     Args:

@@ -6,13 +6,13 @@ the desired states alone, so that it also holds after a restart of the master.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.rights import may_affect
 from rosrm.core.master.state.process import DesiredState, Process
 from rosrm.model.dependencies import circle_fault, circle_in, in_order
-from rosrm.model.values import ProcessSpec
+from rosrm.model.values import EMPTY, ProcessSpec
 from rosrm.wording import listed
 
 
@@ -39,11 +39,17 @@ def dependants_first(state: MasterState, processes: Sequence[Process]) -> list[P
     return [named[name] for name in in_order(before)]
 
 
-def orders_from(state: MasterState, starting: Sequence[ProcessSpec]) -> dict[str, Sequence[str]]:
+def orders_from(
+    state: MasterState, starting: Sequence[ProcessSpec], mates: Mapping[str, Sequence[str]] = EMPTY
+) -> dict[str, Sequence[str]]:
     """Return the dependencies of processes, and of all after which they start.
 
     Of a process that is not among `starting`, each order that is in force or comes into force
     without a further request counts.
+
+    Args:
+        starting: processes with the order that they will have.
+        mates: name of a process to those of its gang, which is followed as a whole.
     """
     given = {spec.name: [spec] for spec in starting}
     pending = {
@@ -59,7 +65,7 @@ def orders_from(state: MasterState, starting: Sequence[ProcessSpec]) -> dict[str
             found[name] = list(
                 dict.fromkeys(one for spec in specs for one in spec.start_order.after)
             )
-            names += found[name]
+            names += (*found[name], *mates.get(name, ()))
     return found
 
 

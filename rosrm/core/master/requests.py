@@ -75,7 +75,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
     )
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
-    check_gangs(state, specs, event.by.name)
+    check_gangs(state, specs, event.by.name, specs)
     check_quota(state, specs, event.by)
     check_store(state, specs, event.by.name, is_operator=event.by.is_operator)
     adopted = {spec.name: spec.adoption for spec in specs if spec.adoption.host}
@@ -340,13 +340,14 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
         if fault:
             raise RequestRefused(f"{fault}. Nothing was restarted")
     ended = [one for one in processes if one.phase.is_terminal]
-    fault = start_order_fault(state, [one.spec for one in ended])
+    starting = [one.spec for one in ended]
+    fault = start_order_fault(state, starting)
     fault = fault or processes_fault(state, [one.name for one in ended])
     if fault:
         raise RequestRefused(f"{fault}. Nothing was restarted")
     for owner in dict.fromkeys(one.principal for one in ended):
         own = [one for one in ended if one.principal == owner]
-        check_gangs(state, [one.spec for one in own], owner, may_join=True)
+        check_gangs(state, [one.spec for one in own], owner, starting, may_join=True)
         check_number(state, len(own), owner, is_operator=own[0].by_operator)
     check_quota(state, (one.spec for one in ended if one.principal == event.by.name), event.by)
     outcomes = Counter(_restart(state, process, now, event.by) for process in processes)

@@ -325,6 +325,31 @@ def test_a_circle_of_starts_is_refused_at_its_place(file):
     assert "a -> b -> c -> a is a circle, in which each process starts after the next" in line
 
 
+def test_a_gang_that_can_never_start_is_refused_at_its_place(refusal):
+    """All processes of a gang are placed in one step."""
+    said = refusal(
+        load_work,
+        """
+        defaults: {command: x}
+        processes:
+          - {name: a, together: g}
+          - {name: b, together: g, after: c}
+          - {name: c, after: a}
+        """,
+    )
+    assert (
+        "f.yaml:5:35: after: b starts after c and c starts after a, but the gang g starts" in said
+    )
+    said = refusal(
+        load_work,
+        """
+        processes:
+          - {name: j, kind: job, command: x, array: 0-2, parallel: 2, together: g}
+        """,
+    )
+    assert "f.yaml:3:73: together: 3 jobs of the array j are in the gang g and start at" in said
+
+
 def test_a_start_order_of_an_entry_for_many_processes(file):
     """The values of `foreach` are filled into names; defaults lie under them."""
     specs = load_work(

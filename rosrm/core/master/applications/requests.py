@@ -236,7 +236,10 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
     specs = [spec for spec, _ in changed]
     superseded = {one.application.name for one in prepared}
     fault = submission_fault(state, changed, superseded) or neighbour_fault(state, specs, by.name)
-    fault = fault or _start_order_fault(state, prepared)
+    desired = [
+        spec for one in prepared if one.version is not None for spec in one.version.specs.values()
+    ]  # fmt: skip
+    fault = fault or _start_order_fault(state, prepared, desired)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
     action = {name: found.action for one in prepared for name, found in one.found.items()}
@@ -244,12 +247,12 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
     for owner in _owners(prepared):  # an operator may apply those of a user
         own = [spec for spec in specs if applications[spec.application].principal == owner.name]
         new = [spec for spec in own if action[spec.name] is Action.START]
-        check_gangs(state, new, owner.name)
+        check_gangs(state, new, owner.name, desired)
         waiting = [
             spec for spec in own
             if (known := state.processes.get(spec.name)) is not None and known.phase in WAITING
         ]  # fmt: skip
-        check_gangs(state, [*new, *waiting], owner.name, may_join=True)
+        check_gangs(state, [*new, *waiting], owner.name, desired, may_join=True)
         check_quota(state, own, by if owner.name == by.name else owner, superseded=superseded)
         versions = [
             one.version.specs.values() for one in prepared
@@ -265,10 +268,10 @@ def _owners(prepared: Iterable[Prepared]) -> list[Requester]:
     return [Requester(name, is_operator=operator) for name, operator in found.items()]
 
 
-def _start_order_fault(state: MasterState, prepared: Iterable[Prepared]) -> str:
+def _start_order_fault(
+    state: MasterState, prepared: Iterable[Prepared], desired: Sequence[ProcessSpec]
+) -> str:
     """Return why a desired process could never start; "": each one may."""
-    versions = [one.version for one in prepared if one.version is not None]
-    desired = [spec for version in versions for spec in version.specs.values()]
     found = [item for one in prepared for item in one.found.items()]
     stopped = {name for name, difference in found if difference.action is Action.STOP}
     for spec in desired:

@@ -341,8 +341,8 @@ def _circle_of_return(
     Other applications may have changed since that version was checked.
     """
     former = application.versions.get(application.former)
-    specs = former.specs.values() if former is not None else ()
-    return circle_from(state, [spec for spec in specs if spec.name not in stay_cancelled])
+    given = former.specs.values() if former is not None else ()
+    return circle_from(state, [spec for spec in given if spec.name not in stay_cancelled])
 
 
 def _is_cancelled(state: MasterState, name: str) -> bool:

@@ -175,6 +175,15 @@ def place_waiting(state: MasterState, now: float) -> None:
         state.placed_at = _versions(state)
 
 
+def held_back(state: MasterState, now: float) -> frozenset[str]:
+    """Return the processes in the queue that wait for something other than room, with their gangs.
+
+    No process may be stopped to make room for them.
+    """
+    neighbours = _awaiting_neighbours(state, now)
+    return _with_gangs(state, _passed_over(state, now) | state.queue.awaiting | neighbours, now)
+
+
 def _place(state: MasterState, passed_over: frozenset[str], now: float) -> None:
     passed_over = _with_gangs(state, passed_over, now)
     if state.settings.backfill:

@@ -14,7 +14,7 @@ cancellation                  the process leaves the gang, and the others do not
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import inf
 from typing import Final
@@ -23,12 +23,14 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.demands import demand_of
 from rosrm.core.master.assignment.gang_search import MOST_MEMBERS, Blocked, find_places_if_empty
 from rosrm.core.master.assignment.neighbours import neighbours_of
+from rosrm.core.master.dependants import orders_from
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.scheduling.feasibility import a_known_host_may, why_never
 from rosrm.core.master.state.demand import Demand
-from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.core.master.state.process import DesiredState, GangKey, Process, ProcessPhase
 from rosrm.model.event_kinds import EventKind
+from rosrm.model.gang_rules import gang_array_fault, gang_order_fault
 from rosrm.model.values import ProcessSpec
 from rosrm.wording import listed, standing
 
@@ -37,11 +39,17 @@ _JUDGED_FOR: Final = 1.0
 
 
 def check_gangs(
-    state: MasterState, specs: Sequence[ProcessSpec], principal: str, *, may_join: bool = False
-) -> None:
-    """Refuse processes whose gang is too large, or has the name of one that has not started.
+    state: MasterState, specs: Sequence[ProcessSpec], principal: str,
+    requested: Sequence[ProcessSpec], *, may_join: bool = False,
+) -> None:  # fmt: skip
+    """Refuse processes whose gang cannot start, or has the name of one that has not started.
 
-    `may_join`: the processes join a gang of that name.
+    Args:
+        state: has the gangs that wait.
+        specs: processes of one owner that start.
+        principal: the owner.
+        requested: all processes of the request, whose start orders may have changed.
+        may_join: the processes join a gang of that name.
     """
     for name in dict.fromkeys(spec.together for spec in specs if spec.together):
         waiting = state.gangs.members.get((principal, name), ())
@@ -58,6 +66,39 @@ def check_gangs(
                 f"another name for `together`. Nothing was queued",
                 "name_taken",
             )
+    gang_of = {spec.name: (principal, spec.together) for spec in specs if spec.together}
+    fault = _start_fault(state, requested, gang_of)
+    if fault:
+        raise RequestRefused(f"{fault}. Nothing was queued")
+
+
+def _start_fault(
+    state: MasterState, requested: Sequence[ProcessSpec], joining: Mapping[str, GangKey]
+) -> str:
+    """Return why a gang could never start after a request; "": each may.
+
+    `joining`: those of the processes that start with their gang.
+    """
+    given = {spec.name: spec for spec in requested}
+    waiting = {
+        name: gang
+        for gang, names in state.gangs.members.items()
+        for name in names
+        if gang is not None and (name not in given or given[name].together == gang[1])
+    }
+    gang_of = {**waiting, **joining}
+    if not gang_of:
+        return ""
+    members: dict[GangKey, list[str]] = {}
+    for name, gang in gang_of.items():
+        members.setdefault(gang, []).append(name)
+    mates = {name: members[gang] for name, gang in gang_of.items()}
+    joined = set(joining.values())
+    changed = {name: gang for name, gang in gang_of.items() if gang in joined}
+    specs = {name: given.get(name) or state.processes[name].spec for name in changed}
+    fault = gang_array_fault(changed, specs)
+    fault = fault or gang_order_fault(gang_of, orders_from(state, requested, mates))
+    return f"{fault.process}: {fault.text}" if fault is not None else ""
 
 
 def members_of(state: MasterState, process: Process) -> list[Process]:

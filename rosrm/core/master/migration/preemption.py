@@ -25,10 +25,11 @@ from typing import Final
 import numpy as np
 
 from rosrm.core.master import lifecycle
+from rosrm.core.master.assignment.assign import held_back
 from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.assignment.gang_search import Blocked, find_places
 from rosrm.core.master.assignment.gangs import members_of
-from rosrm.core.master.assignment.neighbours import awaited_neighbour, running_with
+from rosrm.core.master.assignment.neighbours import running_with
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
 from rosrm.core.master.migration.room import (
@@ -140,10 +141,12 @@ def preempt(state: MasterState, now: float) -> None:
 
 def _review_waiting(state: MasterState, now: float) -> None:
     """Review the first waiting processes, and all for which room is being made."""
-    made = state.preemption.room_made
+    made, held = state.preemption.room_made, held_back(state, now)
     claimed = [state.processes[name] for name, room in made.items() if room.host is not None]
-    due = {one.name: one for one in (*claimed, *_waiting(state, now))}
+    due = {one.name: one for one in (*claimed, *_waiting(state, held, now))}
     for process in sorted(due.values(), key=lambda one: state.queue.position(one.name)):
+        if process.name in held and now < made[process.name].deadline:
+            continue  # its claim stands, but nothing more is stopped for it
         room = _review(state, process, made.pop(process.name, None), now)
         if room is not None:
             made[process.name] = room
@@ -162,8 +165,11 @@ def _set_claims(state: MasterState) -> None:
     state.hosts.set_claims(claims)
 
 
-def _waiting(state: MasterState, now: float) -> Iterator[Process]:
-    """Yield the processes that are placed next, and for which others may make room."""
+def _waiting(state: MasterState, held: AbstractSet[str], now: float) -> Iterator[Process]:
+    """Yield the processes that are placed next, and for which others may make room.
+
+    `held`: names of those that could not start then.
+    """
     owners = (state.owned_by(one) for one in state.instances.values())
     lowest = min((one.spec.priority for one in owners if one is not None), default=inf)
     found = 0
@@ -174,9 +180,7 @@ def _waiting(state: MasterState, now: float) -> Iterator[Process]:
             return  # without backfill: after the first process with its gang
         if process.spec.priority <= lowest or found == _MOST_WAITING:
             return
-        if name in state.queue.delayed or name in state.queue.awaiting:
-            continue
-        if awaited_neighbour(state, process):
+        if name in held:
             continue
         if now - process.since >= state.settings.hysteresis:
             yield process
