@@ -7,20 +7,35 @@ The clocks of fences continue from the recorded last contact with the master, so
 supervisor postpones no fence. After a reboot the length of the outage is unknown, and a successor
 may run elsewhere. So an instance with a fence is fenced. One without has failed with its machine,
 and its restart policy decides.
+
+A loss of power takes the newest lines of the record. So what the record of an earlier boot says
+about an instance that had not ended is uncertain: one that is held or starting there may have run,
+and may have finished. It has an unknown end, too, and only a policy to restart starts it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from math import inf
+from typing import Final
 
 from rosrm import clocks
-from rosrm.core.supervisor.events import Event, Exited, Resumed, SessionEnded, Spawned, SpawnFailed
+from rosrm.core.supervisor.events import (
+    Event,
+    Exited,
+    FencePassed,
+    Resumed,
+    SessionEnded,
+    Spawned,
+    SpawnFailed,
+)
 from rosrm.core.supervisor.instance import (
     HELD,
     RUNNING,
     STARTING,
     STOPPING,
+    THEN_POLICY,
+    THEN_RESTART,
     UNKNOWN_EXIT,
     Instance,
 )
@@ -29,6 +44,8 @@ from rosrm.supervisor import instance_record, lease_file, procfs
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import ProcessTrees, mark
 from rosrm.supervisor.procfs import Stat
+
+_RESTARTED: Final = "its machine was restarted"
 
 
 def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
@@ -40,6 +57,7 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
     for instance in recorded.instances.values():
         if not recorded.same_boot:
             _restart_clock(instance, clocks.boot_time())
+            _doubt(instance)
         alive = instance.fence is not None and instance.fence.alive
         instance.heard = max(instance.heard, newest.at, newest.alive if alive else -inf)
         core.restore(instance)
@@ -54,14 +72,23 @@ def _restart_clock(instance: Instance, now: float) -> None:
     """Restart the clock of an instance recorded in an earlier boot; its deadlines are due now."""
     instance.recent.clear()  # times of the former boot may lie ahead, and would count for hours
     instance.begun = None
-    if instance.pid:
-        instance.fault = "its machine was restarted"
     if instance.deadline is not None:
         instance.deadline = now
     if instance.fence is not None:
         instance.heard = now - instance.fence.after
     if instance.kill_by is not None:
         instance.kill_by = now
+
+
+def _doubt(instance: Instance) -> None:
+    """Let an instance recorded in an earlier boot be one that may have run to its end."""
+    if instance.pid:
+        instance.fault = _RESTARTED
+    if instance.phase in (HELD, STARTING):
+        instance.phase = STARTING  # never held: a free slot would start it
+        instance.exit_code = UNKNOWN_EXIT
+    if instance.then == THEN_RESTART:  # the ordered run may have begun
+        instance.then = THEN_POLICY
 
 
 def what_happened(
@@ -77,7 +104,12 @@ def what_happened(
     for instance in waiting:
         found = trees.in_group(instance.key)
         left = marked.get(mark(instance.key), []) if found is None else found
-        if instance.phase == STARTING:
+        if instance.phase == STARTING and not recorded.same_boot:
+            if instance.fence is not None:
+                yield FencePassed(instance.key)
+            unknown = f"{_RESTARTED}: whether it had run is not known"
+            yield SpawnFailed(instance.key, unknown, transient=True)
+        elif instance.phase == STARTING:
             yield _start_of(instance, left, recorded, trees)
         elif instance.phase in (RUNNING, STOPPING):
             yield from _end_of(instance, left, trees)

@@ -13,7 +13,7 @@ import pytest
 
 import rosrm
 from rosrm import clocks
-from rosrm.core.supervisor.events import ContactReported
+from rosrm.core.supervisor.events import ContactReported, RestartOrdered
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor.client_values import key_of
 from rosrm.supervisor.messages import Remember
@@ -186,11 +186,71 @@ def test_after_a_restart_of_the_machine_the_policy_decides(host, client):
     assert host.running(client, "service").restarts == 2
 
 
+UNKNOWN = "its machine was restarted: whether it had run is not known"
+
+
+@pytest.mark.parametrize("tried", [False, True], ids=["before its spawn", "at its spawn"])
+def test_after_a_restart_of_the_machine_a_job_that_was_starting_runs_no_second_time(
+    host, client, tried
+):
+    """The disk may lack the lines of half a minute, in which the job ran and finished."""
+    host.run(client, host.order("job", "touch", "ran"))
+    host.kill_supervisor(client)
+    host.cut_record(after_spawn=tried)
+    host.rewrite(of_another_boot)
+    (host.state / "work" / "ran").unlink()
+    client = host.connect()
+    (job,) = client.instances
+    assert (job.state, job.message, job.known_exit) == (InstanceState.FAILED, UNKNOWN, None)
+    assert client.receive(0.5) == []
+    assert not (host.state / "work" / "ran").exists()
+
+
+def test_after_a_restart_of_the_machine_what_was_held_may_have_run(host, client):
+    """A job runs no second time, a service is started again, and a fence is for the master."""
+    pid = host.sleeper(client, "first")
+    orders = {"job": {}, "service": {"restart": ALWAYS}, "one": {"fence": Fence(1000.0, 0.0)}}
+    for name, options in orders.items():
+        client.start([host.order(name, "sleep", "1000", slots=1, **options)])
+        host.wait(client, name, InstanceState.HELD)
+    lose_power(host, client, pid)
+    client = host.connect()
+    found = {status.instance.process: status for status in client.instances}
+    assert (found["job"].state, found["job"].message) == (InstanceState.FAILED, UNKNOWN)
+    assert found["job"].known_exit is None
+    assert found["one"].state is InstanceState.FENCED
+    if found["service"].state is not InstanceState.RUNNING:
+        host.running(client, "service")
+    assert len(host.alive()) == 1
+
+
+def test_after_a_restart_of_the_machine_no_job_is_restarted_by_a_former_order(host, client):
+    """The run that the order began may have finished."""
+    client.start([host.order("job", *DEAF, stop=StopPolicy(1000.0, 1000.0))])
+    pid = host.running(client, "job").pid
+    wait_until(host.log("job").read_text, "its handlers")
+    client.send(RestartOrdered(("job", 1)))
+    host.wait(client, "job", InstanceState.STOPPING)
+    left = host.alive()
+    host.kill_supervisor(client)
+    kill(*left)
+    assert pid in left
+    host.rewrite(of_another_boot)
+    client = host.connect()
+    job = host.ended_after_connect(client, "job")
+    assert (job.state, job.message) == (InstanceState.FAILED, "its machine was restarted")
+
+
+def of_another_boot(line: dict) -> None:
+    if line["record"] == "header":
+        line["boot"] = "another"
+
+
 def lose_power(host, client, *pids: int) -> None:
     """Kill supervisor and processes, and rewrite the record as after a reboot of the machine."""
     host.kill_supervisor(client)
     kill(*pids)
-    host.rewrite(lambda line: line["record"] == "header" and line.update(boot="another"))
+    host.rewrite(of_another_boot)
 
 
 def without_fences(line: dict) -> None:
