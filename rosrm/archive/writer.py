@@ -2,7 +2,8 @@
 
 Bytes are appended only at the end of the stored log of a source, and that end is read from the
 file. So a crash at any moment loses no byte and stores none twice: the collector requests bytes
-again that were not written.
+again that were not written. Appended bytes are forced to the disk, because a loss of power may
+leave the size of a file without its newest bytes.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from rosrm.archive.layout import (
 from rosrm.archive.retention import ArchiveLimits, excess, is_within
 from rosrm.model.rows import LogPart
 from rosrm.runtime import durable
-from rosrm.runtime.private_files import make_private_directory, open_private, write_all
+from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor import log_index
 from rosrm.supervisor.log_index import Mark
 
@@ -100,7 +101,7 @@ class ArchiveWriter:
         before = segment.room
         try:
             _add_marks(segment, part)
-            _append(segment.path, part.content)
+            durable.append_durably(str(segment.path), part.content)
         finally:
             self._refresh(source, segment)
         segment = self._segments[source][-1]
@@ -210,14 +211,6 @@ class ArchiveWriter:
         for file in self._directory.glob("hosts/*/*"):
             if file not in expected and is_own_name(file.name):
                 file.unlink()
-
-
-def _append(path: Path, content: bytes) -> None:
-    file = open_private(str(path), os.O_WRONLY | os.O_APPEND)
-    try:
-        write_all(file, content)
-    finally:
-        os.close(file)
 
 
 def _add_marks(segment: Segment, part: LogPart) -> None:

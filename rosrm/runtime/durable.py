@@ -53,6 +53,27 @@ def replace_durably(path: str, content: bytes, mode: int = _PRIVATE) -> None:
     sync_directory(os.path.dirname(path))
 
 
+def append_durably(path: str, content: bytes) -> None:
+    """Append to a file that exists, and force the content to the disk.
+
+    Raises:
+        OSError: the file cannot be written, and may have a beginning of the content; or the content
+            cannot be forced to the disk, and the file has none of it.
+    """
+    file = open_private(path, os.O_WRONLY | os.O_APPEND)
+    try:
+        size = os.fstat(file).st_size
+        write_all(file, content)
+        try:
+            os.fdatasync(file)
+        except OSError:
+            with contextlib.suppress(OSError):  # the first fault is the reason
+                os.ftruncate(file, size)
+            raise
+    finally:
+        os.close(file)
+
+
 def rename_durably(source: str, target: str) -> None:
     """Force a file, or a directory with all that is in it, to the disk; then give it its name.
 

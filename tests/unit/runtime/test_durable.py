@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -27,7 +28,8 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def of_descriptor(file: int) -> str:
         return Path(f"/proc/self/fd/{file}").readlink().name
 
-    monkeypatch.setattr(os, "fsync", noted(os.fsync, of_descriptor))
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(os, name, noted(getattr(os, name), of_descriptor))
     for name in ("replace", "rename"):
         monkeypatch.setattr(os, name, noted(getattr(os, name), lambda *paths: Path(paths[-1]).name))
     return found
@@ -55,3 +57,25 @@ def test_all_in_a_directory_is_on_the_disk_before_it_is_renamed(
     assert calls == [
         "fsync file", "fsync inner", "fsync new", "rename kept", f"fsync {tmp_path.name}",
     ]  # fmt: skip
+
+
+def test_appended_content_is_on_the_disk(tmp_path: Path, calls: list[str]) -> None:
+    path = tmp_path / "log"
+    path.write_bytes(b"one\n")
+    durable.append_durably(str(path), b"two\n")
+    assert path.read_bytes() == b"one\ntwo\n"
+    assert calls == ["fdatasync log"]
+
+
+def test_content_that_the_disk_refuses_is_taken_back(tmp_path: Path, monkeypatch) -> None:
+    """Its size would say that it is stored, and a loss of power would leave zeros."""
+    path = tmp_path / "log"
+    path.write_bytes(b"one\n")
+
+    def fail(_: int) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+    with pytest.raises(OSError, match="Input/output error"):
+        durable.append_durably(str(path), b"two\n")
+    assert path.read_bytes() == b"one\n"
