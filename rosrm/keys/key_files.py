@@ -10,7 +10,7 @@ import base64
 import contextlib
 import fcntl
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import quote
@@ -102,14 +102,20 @@ def rotate(home: Path, directory: Path) -> list[Path]:
             secret stays valid.
     """
     secret = ClusterSecret(os.urandom(KEY_BYTES))
-    written = []
     with _locked(home):
-        for grant in read_grants(home):
-            path = directory / f"{grant.principal.kind}-{quote(grant.principal.name, safe='@')}.key"
-            write_key(path, secret.key_of(grant))
-            written.append(path)
-        _write_secret(home, secret)
-    return written
+        files = {
+            directory / f"{one.principal.kind}-{quote(one.principal.name, safe='@')}.key": one
+            for one in read_grants(home)
+        }
+        with _former_keys_stay(f"the key files in {directory} are not"):
+            try:
+                make_safe_directory(directory)
+            except OSError as error:
+                raise ConfigError(f"{directory} cannot be used: {reason_of(error)}") from None
+            for path, grant in files.items():
+                write_key(path, secret.key_of(grant))
+            _write_secret(home, secret)
+    return list(files)
 
 
 # --- grants --------------------------------------------------------------------------------
@@ -124,21 +130,43 @@ def read_grants(home: Path) -> list[Grant]:
     return [grant for grant, revoked in _all_grants(home) if not revoked]
 
 
-def add_grant(home: Path, principal: Principal, role: Role) -> Grant:
+def add_grant(
+    home: Path, principal: Principal, role: Role, hand_out: Callable[[Grant], None] | None = None
+) -> Grant:
     """Give a principal a role and a new key; its former key becomes invalid.
 
+    Args:
+        home: directory of this user's keys.
+        principal: that gets the key.
+        role: of the principal.
+        hand_out: writes the key to its receiver, before the former key becomes invalid. It is
+            called without the lock, because an output can block.
+
     Raises:
-        ConfigError: the file is invalid, others can read it, or it cannot be written.
+        ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
+            key stays valid.
     """
     import secrets  # noqa: PLC0415 - OpenSSL, which a slave does not need
 
-    with _locked(home):
-        others = [one for one in _all_grants(home) if one[0].principal != principal]
-        # The generation is random, because a counter would repeat that of a revoked key after the
-        # file of the grants was lost or restored from a backup. Then that key would be valid again.
-        grant = Grant(principal, role, 1 + secrets.randbelow(_GENERATIONS - 1))
-        _write_grants(home, [*others, (grant, False)])
+    # The generation is random, because a counter would repeat that of a revoked key after the file
+    # of the grants was lost or restored from a backup. Then that key would be valid again.
+    grant = Grant(principal, role, 1 + secrets.randbelow(_GENERATIONS - 1))
+    with _former_keys_stay(f"the new key of {principal} is not"):
+        if hand_out is not None:
+            hand_out(grant)
+        with _locked(home):
+            others = [one for one in _all_grants(home) if one[0].principal != principal]
+            _write_grants(home, [*others, (grant, False)])
     return grant
+
+
+@contextlib.contextmanager
+def _former_keys_stay(and_new: str) -> Iterator[None]:
+    """Extend an error before the change of the grants or of the secret by its consequence."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{error}. Former keys stay valid, and {and_new}") from None
 
 
 def revoke(home: Path, principals: Collection[Principal]) -> None:
@@ -203,13 +231,18 @@ def _fields_of(key: PrincipalKey) -> dict[str, Any]:
 
 
 def write_key(path: Path, key: PrincipalKey) -> None:
-    """Write a principal's key file; missing directories are created.
+    """Write a principal's key file.
 
     Raises:
-        ConfigError: the file cannot be written.
+        ConfigError: the directory does not exist, or the file cannot be written.
     """
     try:
+        path.parent.stat()  # a mistyped path is refused, not created
         make_safe_directory(path.parent)
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path} cannot be written: there is no directory {path.parent}"
+        ) from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from None
     _write(path, _fields_of(key))

@@ -18,6 +18,7 @@ from rosrm.wording import counted
 
 if TYPE_CHECKING:
     from rosrm.keys.cluster import ClusterSecret
+    from rosrm.keys.roles import Grant
 
 key = typer.Typer(no_args_is_help=True, help="Manage the keys of hosts and users.")
 
@@ -83,12 +84,15 @@ def add(
         raise ConfigError(f"{named} cannot have the role {chosen!r}; allowed: {', '.join(names)}")
     if out is None:
         _make_output_private()
-    grant = key_files.add_grant(home, named, Role(chosen))
-    made = secret.key_of(grant)
-    if out is None:
-        echo(key_files.text_of(made).rstrip())
-    else:
-        key_files.write_key(out, made)
+
+    def hand_out(grant: Grant) -> None:
+        made = secret.key_of(grant)
+        if out is None:
+            echo(key_files.text_of(made).rstrip())
+        else:
+            key_files.write_key(out, made)
+
+    key_files.add_grant(home, named, Role(chosen), hand_out)
     former = "; its former key is no longer valid" if present else ""
     echo(
         f"rosrm: {named} has a new key (role {chosen}){former}. Copy the file to ~/.config/rosrm/ "

@@ -158,14 +158,70 @@ def test_the_file_behind_the_standard_output_becomes_private(home, secret, tmp_p
 
 
 def test_an_output_file_is_private_from_its_beginning(rosrm, secret, tmp_path):
-    """Missing directories are made; an earlier file with another mode is replaced."""
-    path = tmp_path / "new" / "ada.key"
+    """An earlier file with another mode is replaced."""
+    path = tmp_path / "ada.key"
     assert rosrm("key", "add", "user:ada", "--out", path).out == ""
     former = key_files.read_key(path)
     path.chmod(0o644)
     assert rosrm("key", "add", "user:ada", "--out", path).code == 0
     assert mode_of(path) == 0o600
     assert key_files.read_key(path) != former
+
+
+def unwritable(tmp_path, fault):
+    """Return a path that cannot be written, and the reason."""
+    if fault == "no directory":
+        folder = tmp_path / "missing"
+        return folder / "ada.key", f"there is no directory {folder}"
+    (folder := tmp_path / "others").mkdir()
+    folder.chmod(0o777)
+    return folder / "ada.key", (
+        f"{folder} is writable for all users, who could replace it (`chmod o-w {folder}`)"
+    )
+
+
+@pytest.mark.parametrize("fault", ["no directory", "of others"])
+def test_a_key_that_cannot_be_written_leaves_the_former_one_valid(rosrm, home, tmp_path, fault):
+    """Otherwise the principal would have no key at all."""
+    rosrm("key", "init")
+    rosrm("key", "add", "user:ada", "--role", "viewer")
+    before = key_files.read_grants(home)
+    path, reason = unwritable(tmp_path, fault)
+    result = rosrm("key", "add", "user:ada", "--role", "operator", "--out", path)
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        f"rosrm: {path} cannot be written: {reason}. Former keys stay valid, and the new key of "
+        "user:ada is not\n"
+    )
+    assert key_files.read_grants(home) == before
+    assert not (tmp_path / "missing").exists()
+
+
+def test_a_key_that_the_output_does_not_take_leaves_the_former_one_valid(rosrm, home, secret):
+    """The output can be a file on a full disk."""
+    rosrm("key", "add", "user:ada")
+    before = key_files.read_grants(home)
+    with Path("/dev/full").open("wb") as output:
+        done = subprocess.run(
+            [sys.executable, "-m", "rosrm.cli", "key", "add", "user:ada"],
+            stdout=output, stderr=subprocess.PIPE, text=True, check=False,
+        )  # fmt: skip
+    assert done.returncode != 0
+    assert "has a new key" not in done.stderr
+    assert "No space left on device" in done.stderr
+    assert key_files.read_grants(home) == before
+
+
+def test_a_rotation_into_a_directory_of_others_ends_no_key(rosrm, home, secret, tmp_path):
+    rosrm("key", "add", "user:ada")
+    path, reason = unwritable(tmp_path, "of others")
+    result = rosrm("key", "rotate", "--out", path.parent)
+    assert (result.code, result.out) == (2, "")
+    assert result.err == (
+        f"rosrm: {path.parent} cannot be used: {reason}. Former keys stay valid, and the key files "
+        f"in {path.parent} are not\n"
+    )
+    assert key_files.read_secret(home) == secret
 
 
 # --- revoke, rotate ---------------------------------------------------------------------------
@@ -300,6 +356,7 @@ def test_a_user_without_a_key_gets_a_remedy(rosrm, home):
 def robot(home):
     """Make the directory of keys that of a robot, with the keys of its host and a viewer."""
     secret = ClusterSecret(bytes(32))
+    home.mkdir(mode=0o700)
     for name, row in (("robot-1", "host"), ("ada", "viewer")):
         kind = "host" if row == "host" else "user"
         grant = key_files._grant_in(
