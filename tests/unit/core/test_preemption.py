@@ -11,6 +11,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
+from rosrm.core.master import events as happened
 from rosrm.core.master.migration.preemption import Group, covering_sets, rank
 from rosrm.core.master.recovery import journal_gap
 from rosrm.core.master.state.process import Process, ProcessPhase
@@ -472,3 +473,19 @@ def test_a_claim_ends_with_the_setting() -> None:
     cluster.state.settings = replace(cluster.state.settings, preemption=False)
     cluster.wait(1.5)
     assert cluster.state.hosts.claims == {}
+
+
+def test_no_process_makes_room_before_a_host_that_registers_now_has_asked_for_work() -> None:
+    """As after each restart of the master; the placement waits for that host, too."""
+    cluster = cluster_of(machine("a"), preemption="requeue")
+    cluster.submit(process("low", memory=800))
+    cluster.submit(process("p", memory=500, priority=5))
+    cluster.now += 1.5
+    late = cluster.machines["b"] = machine("b")
+    late.incarnation = 9
+    assert cluster.enter(late, 0, ()).accepted
+    cluster.read(cluster.machines["a"])
+    cluster.tell(happened.TimePassed())
+    assert cluster.phase("low") == "running"
+    cluster.wait(3.0)
+    assert (cluster.where("p"), cluster.phase("low")) == (["b"], "running")

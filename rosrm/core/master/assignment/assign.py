@@ -161,7 +161,7 @@ def place_waiting(state: MasterState, now: float) -> None:
     if why:
         state.processes[head].reason = why
         return
-    why = _first_request_awaited(state, now)
+    why = first_request_awaited(state, now)
     if why:
         state.processes[head].reason = state.processes[head].reason or why
         return
@@ -200,7 +200,7 @@ def _place_with_neighbours(state: MasterState, passed_over: frozenset[str], now:
         _place(state, passed_over | awaiting, now)
 
 
-def _first_request_awaited(state: MasterState, now: float) -> str:
+def first_request_awaited(state: MasterState, now: float) -> str:
     """Return why placement waits for recently registered hosts; "" if it does not wait.
 
     Without the wait, the host with the first request would get every process that was submitted

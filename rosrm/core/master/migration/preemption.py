@@ -25,7 +25,7 @@ from typing import Final
 import numpy as np
 
 from rosrm.core.master import lifecycle
-from rosrm.core.master.assignment.assign import held_back
+from rosrm.core.master.assignment.assign import first_request_awaited, held_back
 from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.assignment.gang_search import Blocked, find_places
 from rosrm.core.master.assignment.gangs import members_of
@@ -134,7 +134,9 @@ def preempt(state: MasterState, now: float) -> None:
         if name not in state.queue or state.processes[name].since > last:  # placed, or another one
             del known.room_made[name]
     _set_claims(state)
-    if not state.settings.preemption or not len(state.queue) or why_no_work(state, now):
+    if not state.settings.preemption or not len(state.queue):
+        return
+    if why_no_work(state, now) or first_request_awaited(state, now):
         return  # while the master assigns no work, the claims stand as they are
     _review_waiting(state, now)
 
