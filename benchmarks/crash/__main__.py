@@ -1,0 +1,83 @@
+"""States of the disk after a loss of power at each moment of a scenario, each given to its reader.
+
+A real cluster is recorded. After each recorded call the legal states of ext4 and XFS are made, and
+the real reader of each part starts on each that differs from all before: the master's journal, the
+keys, the supervisor of the host. A fault is a promise of docs/faults.md that a state breaks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import random
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.crash.disk import Disk, FileSystem, State
+from benchmarks.crash.oracle import Oracle
+from benchmarks.crash.scenario import record
+from benchmarks.machine import parser, print_report, say
+from benchmarks.stopping import run
+
+
+def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
+    """Return the number of states of each part and file system, and the faults."""
+    recording, effects = record(folder)
+    calls, draw = list(recording.calls()), random.Random(arguments.seed)
+    oracle = Oracle(recording.root, effects)
+    states = {part: {kind.value: 0 for kind in FileSystem} for part in oracle.checks}
+    faults: dict[str, list[str]] = {}
+    seen: set[bytes] = set()
+    for kind in FileSystem:
+        disk = Disk(kind, recording.attributes)
+        for number, call in enumerate(calls, 1):
+            disk.apply(call)
+            if draw.random() >= arguments.share:
+                continue
+            for state in disk.states(draw, arguments.each):
+                for part in oracle.checks:
+                    if (digest := _digest(state, part)) in seen:
+                        continue
+                    seen.add(digest)
+                    states[part][kind.value] += 1
+                    for fault in oracle.faults(part, state):
+                        faults.setdefault(f"{part}: {fault}", []).append(state.how)
+            if number % 100 == 0:
+                say(f"benchmarks.crash: {kind.value}, call {number} of {len(calls)}, {states}")
+    return {"calls": len(calls), "states": states, "faults": faults}
+
+
+def _digest(state: State, part: str) -> bytes:
+    """Return a digest of one part of a state, with what the user was told."""
+    found = hashlib.blake2b(digest_size=16)
+    for path in sorted(state.entries):
+        if path.startswith(part):
+            found.update(f"{path}\\0".encode())
+            content = state.entries[path]
+            found.update(content if isinstance(content, bytes) else repr(content).encode())
+    found.update(repr(state.told).encode())
+    return found.digest()
+
+
+def options() -> argparse.ArgumentParser:
+    """Return the parser of the command line."""
+    command_line = parser(__doc__)
+    command_line.add_argument("--share", type=float, default=1.0, help="share of the calls")
+    command_line.add_argument("--each", type=int, default=20, help="states after each call")
+    command_line.add_argument("--seed", type=int, default=1, help="of what is drawn")
+    return command_line
+
+
+def main() -> None:
+    """Measure and print one JSON object; exit with 1 if a promise is broken."""
+    arguments = options().parse_args()
+    with tempfile.TemporaryDirectory(prefix="rosrm-crash-") as folder:
+        figures = measure(arguments, Path(folder))
+    print_report("crash", {**vars(arguments), **figures}, runs=1)
+    sys.exit(1 if figures["faults"] else 0)
+
+
+if __name__ == "__main__":
+    sys.exit(run("crash", main))

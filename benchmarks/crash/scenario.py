@@ -1,0 +1,177 @@
+"""A real cluster whose writes are recorded, and what its user was told meanwhile."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.crash.recording import Recording
+from rosrm.client.client import Client
+from rosrm.client.waiting import Until
+from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.testing.local_cluster import LocalCluster
+
+HOST: Final = "host0"
+_PATIENCE: Final = 120.0
+#: Program of each process: it tells what it found, and a service runs on.
+_PROGRAM: Final = """#!/bin/sh
+name=$1 then=$2 effects=$3 artifact=$4
+while [ $# -gt 0 ]; do [ "$1" = --params-file ] && parameters=$2; shift; done
+echo "$name" $(cat $parameters /dev/null | cksum) $(cat $artifact /dev/null | cksum) >> "$effects"
+echo "output of $name"
+[ "$then" = end ] || exec sleep 1000
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Files of a scenario outside of what is recorded.
+
+    Attributes:
+        program: of each process.
+        effects: file to which each process adds a line when it starts.
+        artifact: file that is sent.
+    """
+
+    program: Path
+    effects: Path
+    artifact: Path
+
+    @classmethod
+    def make(cls, folder: Path) -> Places:
+        """Make them in a folder."""
+        made = cls(folder / "program.sh", folder / "effects", folder / "model.txt")
+        made.program.write_text(_PROGRAM)
+        made.program.chmod(0o755)
+        made.effects.touch()
+        made.artifact.write_text("weights " * 900)
+        return made
+
+    def process(self, name: str, *, then: str, **options: Any) -> dict[str, Any]:
+        """Return a process of a work file."""
+        artifact = "{artifacts}/model.txt" if "artifacts" in options else ""
+        return {
+            "name": name, "command": [str(self.program), name, then, str(self.effects), artifact],
+            "kind": "job" if then == "end" else "service", **options,
+        }  # fmt: skip
+
+
+class Scenario:
+    """Steps of a user; each one marks what it was told."""
+
+    def __init__(self, recording: Recording, cluster: LocalCluster, places: Places) -> None:
+        self._recording = recording
+        self._cluster = cluster
+        self._places = places
+        self._host = cluster.hosts[0]
+        self._client = Client(connection=cluster.client)
+
+    def play(self) -> None:
+        """Play all steps."""
+        self._keys()
+        self._processes()
+        self._restarts()
+        self._stops()
+
+    def _keys(self) -> None:
+        for number in range(3):
+            name = f"host:robot-{number}"
+            out = self._cluster.directory / f"robot-{number}.key"
+            self._command("key", "add", name, "--out", str(out))
+            self._recording.mark(f"added {name}")
+        self._command("key", "revoke", "host:robot-1")
+        self._recording.mark("revoked host:robot-1")
+
+    def _processes(self) -> None:
+        files = {"artifacts": {"model.txt": str(self._places.artifact)}}
+        ros = {"ros": True, "readiness": "running", "parameters": {"rate": 5, "frame": "map"}}
+        jobs = [self._places.process(f"job{n}", then="end") for n in range(6)]
+        nodes = [
+            self._places.process(f"node{n}", then="run", **ros, **files) for n in range(2)
+        ]  # fmt: skip
+        self._submit([*nodes, *jobs])
+        for node in nodes:
+            self._wait(node["name"], "runs")
+        for job in jobs:
+            self._wait(job["name"], "ended")
+
+    def _restarts(self) -> None:
+        master = self._cluster.master
+        assert master is not None
+        master.end(signal.SIGKILL)
+        master.process.wait(_PATIENCE)
+        self._cluster.start_master()
+        self._cluster.wait_for_hosts(_PATIENCE)
+        self._submit([self._places.process("late", then="end")])
+        self._wait("late", "ended")
+        slave = self._cluster.slaves[HOST]
+        slave.end(signal.SIGKILL)
+        slave.process.wait(_PATIENCE)
+        self._cluster.start_slave(self._host)
+        self._cluster.wait_for_hosts(_PATIENCE)
+        self._submit([self._places.process("later", then="end")])
+        self._wait("later", "ended")
+
+    def _stops(self) -> None:
+        self._client.cancel("node1")
+        self._wait("node1", "ended")
+
+    def _submit(self, work: Sequence[dict[str, Any]]) -> None:
+        self._client.submit(work)
+        for one in work:
+            self._recording.mark(f"submitted {one['name']}")
+
+    def _wait(self, name: str, told: str) -> None:
+        until: Until = "settled" if told == "runs" else "ended"
+        if not self._client.wait(name, until=until, timeout=_PATIENCE):
+            raise RuntimeError(f"{name}: {self._client.get_process(name)}")
+        self._recording.mark(f"{told} {name}")
+
+    def _command(self, *words: str) -> None:
+        subprocess.run(
+            [sys.executable, "-m", "rosrm.cli", *words], check=True, stdout=subprocess.DEVNULL
+        )
+
+
+@contextmanager
+def _variables(variables: dict[str, str]) -> Iterator[None]:
+    """Give variables to the processes that are started meanwhile."""
+    former = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in former.items():
+            os.environ.pop(name, None)
+            if value is not None:
+                os.environ[name] = value
+
+
+def record(folder: Path) -> tuple[Recording, Path]:
+    """Play the scenario in a new folder; return its recording, and the file of the effects."""
+    recording, places = Recording(folder / "disk", folder), Places.make(folder)
+    recording.make("cluster/", "cluster/master.log", f"cluster/{HOST}.log")  # for their output
+    keys = {"ROSRM_KEYS": str(recording.root / "keys")}
+    settings = ClusterConfig()
+    settings = replace(settings, journal=replace(settings.journal, sync="full"))
+    hosts = [
+        HostConfig(
+            host=HOST, scope="slice", max_processes=4,
+            budget={"memory": 2.0**34, "cpu": 64.0}, probes={"memory": {}, "cpu": {}},
+        )
+    ]  # fmt: skip
+    with (
+        _variables({**recording.environment, **keys}),
+        LocalCluster(recording.root / "cluster", cluster=settings, hosts=hosts) as cluster,
+    ):
+        cluster.wait_for_hosts(_PATIENCE)
+        Scenario(recording, cluster, places).play()
+    recording.end()
+    return recording, places.effects
