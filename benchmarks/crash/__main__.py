@@ -28,7 +28,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     calls, draw = list(recording.calls()), random.Random(arguments.seed)
     oracle = Oracle(recording.root, effects)
     states = {part: {kind.value: 0 for kind in FileSystem} for part in oracle.checks}
-    faults: dict[str, list[str]] = {}
+    faults: dict[str, dict[str, Any]] = {}
     seen: set[bytes] = set()
     for kind in FileSystem:
         disk = Disk(kind, recording.attributes)
@@ -43,7 +43,8 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
                     seen.add(digest)
                     states[part][kind.value] += 1
                     for fault in oracle.faults(part, state):
-                        faults.setdefault(f"{part}: {fault}", []).append(state.how)
+                        known = faults.setdefault(f"{part}: {fault}", {"states": 0, "first": state.how})
+                        known["states"] += 1
             if number % 100 == 0:
                 say(f"benchmarks.crash: {kind.value}, call {number} of {len(calls)}, {states}")
     return {"calls": len(calls), "states": states, "faults": faults}

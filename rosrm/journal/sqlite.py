@@ -7,7 +7,9 @@ disk, so the group also survives a power failure.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,18 +21,19 @@ from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import mapping_to_json
 from rosrm.model.records import Intent, Record, StoredRecord
+from rosrm.runtime.durable import rename_durably
 from rosrm.runtime.private_files import make_private_directory, make_private_file
 
 #: Version of the tables; a file with another version is refused.
 SCHEMA: Final = 1
 
 _TABLES: Final = """
-CREATE TABLE IF NOT EXISTS record (
+CREATE TABLE record (
     sequence INTEGER PRIMARY KEY, wall REAL NOT NULL, elapsed REAL NOT NULL, kind TEXT NOT NULL,
     process TEXT NOT NULL, host TEXT NOT NULL, message TEXT NOT NULL, facts TEXT NOT NULL
 );
-CREATE INDEX IF NOT EXISTS record_process ON record (process) WHERE process != '';
-CREATE TABLE IF NOT EXISTS intent (
+CREATE INDEX record_process ON record (process) WHERE process != '';
+CREATE TABLE intent (
     tbl TEXT NOT NULL, key TEXT NOT NULL, value TEXT NOT NULL, PRIMARY KEY (tbl, key)
 ) WITHOUT ROWID;
 """
@@ -84,6 +87,8 @@ class SqliteJournal:
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:
             raise sqlite3.DatabaseError("it is empty: not even tables are in it")
+        if not self._path.exists():
+            self._create()
         database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
         try:
             self._prepare(database, sync)
@@ -105,7 +110,7 @@ class SqliteJournal:
         if verdict != "ok":
             raise sqlite3.DatabaseError(verdict)
         if version == 0:
-            self._make(database)
+            raise no_journal(self._path)
         database.execute(f"PRAGMA busy_timeout={_PATIENCE_MS}")
 
     def _make_private(self) -> None:
@@ -113,10 +118,17 @@ class SqliteJournal:
         for suffix in ("", "-wal", "-shm"):
             make_private_file(f"{self._path}{suffix}")
 
-    def _make(self, database: sqlite3.Connection) -> None:
-        if database.execute("SELECT 1 FROM sqlite_master").fetchone() is not None:
-            raise no_journal(self._path)
-        database.executescript(f"BEGIN IMMEDIATE; {_TABLES}; PRAGMA user_version={SCHEMA}; COMMIT;")
+    def _create(self) -> None:
+        """Make the file with its tables, then name it: an empty one would count as damaged."""
+        new = f"{self._path}.new"
+        # Of a start that was cut, or of a journal that was moved away without its log.
+        for left in (new, f"{new}-journal", f"{self._path}-wal", f"{self._path}-shm"):
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(left)
+        with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as database:
+            database.executescript(f"BEGIN; {_TABLES}; PRAGMA user_version={SCHEMA}; COMMIT;")
+        make_private_file(new)
+        rename_durably(new, str(self._path))
 
     def _guarded(self, act: Callable[[], Any]) -> Any:
         try:

@@ -183,6 +183,23 @@ def test_a_damaged_log_costs_what_is_behind_the_damage(path, opened) -> None:
     assert journal.last_sequence == 2 * last
 
 
+def test_a_new_journal_takes_nothing_of_what_a_cut_start_and_a_former_one_left(path) -> None:
+    """Also the log of a journal that was moved away without it is not read."""
+    writer = run(WRITER, path)
+    writer.stdout.readline()
+    writer.kill()
+    writer.wait(30)
+    writer.stdout.close()
+    assert path.with_name("journal.sqlite-wal").stat().st_size
+    path.unlink()
+    path.with_name("journal.sqlite.new").write_bytes(os.urandom(5000))
+
+    with contextlib.closing(SqliteJournal(path)) as journal:
+        assert journal.last_sequence == 0
+        journal.write([Record("a")], [], 0.0)
+    assert not path.with_name("journal.sqlite.new").exists()
+
+
 def test_an_occupied_path_of_the_write_ahead_log_is_reported(path) -> None:
     """The log's path is occupied, and the message names it."""
     fill(path)
