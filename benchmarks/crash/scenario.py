@@ -22,11 +22,12 @@ HOST: Final = "host0"
 _PATIENCE: Final = 120.0
 #: Program of each process: it tells what it found, and a service runs on.
 _PROGRAM: Final = """#!/bin/sh
-name=$1 then=$2 effects=$3 artifact=$4
+name=${ROSRM_INSTANCE%%#*} then=$1 effects=$2 artifact=$3
 while [ $# -gt 0 ]; do [ "$1" = --params-file ] && parameters=$2; shift; done
 echo "$name" $(cat $parameters /dev/null | cksum) $(cat $artifact /dev/null | cksum) >> "$effects"
 echo "output of $name"
-[ "$then" = end ] || exec sleep 1000
+[ "$then" = end ] && exec sleep 0.2
+exec sleep 1000
 """
 
 
@@ -58,7 +59,7 @@ class Places:
         """Return a process of a work file."""
         artifact = "{artifacts}/model.txt" if "artifacts" in options else ""
         return {
-            "name": name, "command": [str(self.program), name, then, str(self.effects), artifact],
+            "name": name, "command": [str(self.program), then, str(self.effects), artifact],
             "kind": "job" if then == "end" else "service", **options,
         }  # fmt: skip
 
@@ -76,7 +77,9 @@ class Scenario:
     def play(self) -> None:
         """Play all steps."""
         self._keys()
-        self._processes()
+        self._jobs(1)  # from which the master learns that they are short
+        self._jobs(8)  # of which the host holds one ahead
+        self._nodes()
         self._restarts()
         self._stops()
 
@@ -89,18 +92,19 @@ class Scenario:
         self._command("key", "revoke", "host:robot-1")
         self._recording.mark("revoked host:robot-1")
 
-    def _processes(self) -> None:
-        files = {"artifacts": {"model.txt": str(self._places.artifact)}}
-        ros = {"ros": True, "readiness": "running", "parameters": {"rate": 5, "frame": "map"}}
-        jobs = [self._places.process(f"job{n}", then="end") for n in range(6)]
-        nodes = [
-            self._places.process(f"node{n}", then="run", **ros, **files) for n in range(2)
-        ]  # fmt: skip
-        self._submit([*nodes, *jobs])
-        for node in nodes:
-            self._wait(node["name"], "runs")
+    def _jobs(self, count: int) -> None:
+        jobs = [self._places.process(f"job{count}_{n}", then="end") for n in range(count)]
+        self._submit(jobs)
         for job in jobs:
             self._wait(job["name"], "ended")
+
+    def _nodes(self) -> None:
+        files = {"artifacts": {"model.txt": str(self._places.artifact)}}
+        ros = {"ros": True, "readiness": "running", "parameters": {"rate": 5, "frame": "map"}}
+        nodes = [self._places.process(f"node{n}", then="run", **ros, **files) for n in range(2)]
+        self._submit(nodes)
+        for node in nodes:
+            self._wait(node["name"], "runs")
 
     def _restarts(self) -> None:
         master = self._cluster.master
@@ -163,7 +167,7 @@ def record(folder: Path) -> tuple[Recording, Path]:
     settings = replace(settings, journal=replace(settings.journal, sync="full"))
     hosts = [
         HostConfig(
-            host=HOST, scope="slice", max_processes=4,
+            host=HOST, scope="slice", max_processes=3,
             budget={"memory": 2.0**34, "cpu": 64.0}, probes={"memory": {}, "cpu": {}},
         )
     ]  # fmt: skip
