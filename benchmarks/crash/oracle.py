@@ -17,9 +17,14 @@ from typing import Final
 from benchmarks.crash.disk import State
 from benchmarks.crash.scenario import HOST
 from rosrm import clocks
+from rosrm.archive.layout import read_segments
+from rosrm.archive.reader import LogArchive
+from rosrm.archive.retention import ArchiveLimits
+from rosrm.archive.writer import ArchiveWriter
 from rosrm.errors import RosrmError
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys import key_files
+from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceState
 from rosrm.supervisor import procfs
 from rosrm.supervisor.client import SupervisorClient
@@ -41,9 +46,12 @@ class Oracle:
     def __init__(self, root: Path, effects: Path) -> None:
         self._root, self._effects = root, effects
         self._first = _lines(effects)
+        logs = root / "cluster" / "hosts" / HOST / "supervisor" / "logs"
+        self._logs = {path.name: path.read_bytes() for path in logs.glob("*.log")}
         #: Part of the directory to the check of its reader.
         self.checks: Mapping[str, Callable[[State], Iterator[str]]] = {
-            "keys": self._keys, "cluster/master": self._journal, f"cluster/hosts/{HOST}": self._host
+            "keys": self._keys, "cluster/master": self._journal,
+            f"cluster/hosts/{HOST}": self._host, "archive": self._archive,
         }  # fmt: skip
 
     def faults(self, part: str, state: State) -> list[str]:
@@ -100,6 +108,24 @@ class Oracle:
                 yield f"{name} has ended, and runs again"
             elif found != self._first[name]:
                 yield f"{name} runs with other files: {found}, not {self._first[name]}"
+
+    def _archive(self, state: State) -> Iterator[str]:
+        """Continue each stored log as a collector does, and compare it with the log itself."""
+        directory = self._root / "archive"
+        writer = ArchiveWriter(directory, ArchiveLimits(keep=1 << 40, keep_host=1 << 40))
+        for source in list(read_segments(directory)):
+            log = self._logs[f"{source.process}.{source.number}.log"]
+            position = writer.position(source)
+            if position > len(log):
+                yield f"{position} bytes of {source.process} are stored, and it wrote {len(log)}"
+                continue
+            part = LogPart(
+                source.number, [source.number], log[position:], position, len(log), ended=True, marks=()
+            )
+            writer.add(source, part)
+            stored = LogArchive(directory).read_log(*source, 0, len(log)).content
+            if stored != log:
+                yield f"the stored log of {source.process} is not what it wrote"
 
     def _let_boot(self, supervisor: Path) -> None:
         """Make this boot another one than that of the recording."""

@@ -25,8 +25,8 @@ _PROGRAM: Final = """#!/bin/sh
 name=${ROSRM_INSTANCE%%#*} then=$1 effects=$2 artifact=$3
 while [ $# -gt 0 ]; do [ "$1" = --params-file ] && parameters=$2; shift; done
 echo "$name" $(cat $parameters /dev/null | cksum) $(cat $artifact /dev/null | cksum) >> "$effects"
-echo "output of $name"
-[ "$then" = end ] && exec sleep 0.2
+for n in 1 2 3; do seq -f "line %g of $name" 150; sleep 0.1; done
+[ "$then" = end ] && exit 0
 exec sleep 1000
 """
 
@@ -73,9 +73,23 @@ class Scenario:
         self._places = places
         self._host = cluster.hosts[0]
         self._client = Client(connection=cluster.client)
+        self._archive = recording.root / "archive"
 
     def play(self) -> None:
         """Play all steps."""
+        with self._collecting():
+            self._play()
+
+    @contextmanager
+    def _collecting(self) -> Iterator[None]:
+        words = [sys.executable, "-m", "rosrm.cli", "collect-logs", str(self._archive)]
+        with subprocess.Popen(words, env={**os.environ, **self._cluster.ros.environment()}) as one:
+            try:
+                yield
+            finally:
+                one.send_signal(signal.SIGINT)
+
+    def _play(self) -> None:
         self._keys()
         self._jobs(1)  # from which the master learns that they are short
         self._jobs(8)  # of which the host holds one ahead
