@@ -12,11 +12,13 @@ import hashlib
 import random
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from benchmarks.crash.disk import Disk, FileSystem, State
 from benchmarks.crash.oracle import Oracle
+from benchmarks.crash.recording import Recording
 from benchmarks.crash.scenario import record
 from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
@@ -25,29 +27,36 @@ from benchmarks.stopping import run
 def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     """Return the number of states of each part and file system, and the faults."""
     recording, effects = record(folder)
-    calls, draw = list(recording.calls()), random.Random(arguments.seed)
     oracle = Oracle(recording.root, effects)
-    states = {part: {kind.value: 0 for kind in FileSystem} for part in oracle.checks}
+    tried = {part: {kind.value: 0 for kind in FileSystem} for part in oracle.checks}
     faults: dict[str, dict[str, Any]] = {}
     seen: set[bytes] = set()
+    for kind, state in _states(recording, arguments):
+        for part in oracle.checks:
+            if (digest := _digest(state, part)) in seen:
+                continue
+            seen.add(digest)
+            tried[part][kind.value] += 1
+            for fault in oracle.faults(part, state):
+                known = faults.setdefault(f"{part}: {fault}", {"states": 0, "first": state.how})
+                known["states"] += 1
+    return {"states": tried, "faults": faults}
+
+
+def _states(
+    recording: Recording, arguments: argparse.Namespace
+) -> Iterator[tuple[FileSystem, State]]:
+    """Yield the states of a share of the moments."""
+    calls = list(recording.calls())
+    draw = random.Random(arguments.seed)  # noqa: S311 - no secret
     for kind in FileSystem:
         disk = Disk(kind, recording.attributes)
         for number, call in enumerate(calls, 1):
             disk.apply(call)
-            if draw.random() >= arguments.share:
-                continue
-            for state in disk.states(draw, arguments.each):
-                for part in oracle.checks:
-                    if (digest := _digest(state, part)) in seen:
-                        continue
-                    seen.add(digest)
-                    states[part][kind.value] += 1
-                    for fault in oracle.faults(part, state):
-                        known = faults.setdefault(f"{part}: {fault}", {"states": 0, "first": state.how})
-                        known["states"] += 1
-            if number % 100 == 0:
-                say(f"benchmarks.crash: {kind.value}, call {number} of {len(calls)}, {states}")
-    return {"calls": len(calls), "states": states, "faults": faults}
+            if draw.random() < arguments.share:
+                yield from ((kind, state) for state in disk.states(draw, arguments.each))
+            if number % 200 == 0:
+                say(f"benchmarks.crash: {kind.value}, call {number} of {len(calls)}")
 
 
 def _digest(state: State, part: str) -> bytes:

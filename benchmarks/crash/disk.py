@@ -5,7 +5,8 @@ The model, with the default options of both:
 - Changes of names are kept in their order: a state has a first part of them. `fsync` forces what
   came before: with ext4 all of it, with XFS what came before the last change of that inode.
 - The data of a file is kept in any order with names and other files. What a file got since its last
-  `fsync` may be missing, be there in part, or (an append to the last block) be zeros.
+  `fsync` may be missing, be there in part, or (an append to the last block) be zeros, also before
+  further data.
 - ext4 writes the data of a file before a rename that replaces another (`auto_da_alloc`).
 
 Sources: Pillai and others, "All File Systems Are Not Created Equal", OSDI 2014 (the tool ALICE),
@@ -44,6 +45,7 @@ class Data(Enum):
     NONE = "none"
     HALF = "half"
     ZEROS = "zeros"
+    HOLE = "hole"
     LATE = "late"
     ALL = "all"
 
@@ -72,9 +74,11 @@ class Node:
         base, rest = _applied(self.durable, self.pending[:count]), self.pending[count:]
         if data is Data.NONE or not rest:
             return base
-        if data is Data.ZEROS:
-            end = min(len(_applied(base, rest)), -(-len(base) // _BLOCK) * _BLOCK)
-            return base.ljust(end, b"\0")
+        if data in (Data.ZEROS, Data.HOLE):
+            # The file already had the rest of its last block, so its new size may come first.
+            new, end = _applied(base, rest), -(-len(base) // _BLOCK) * _BLOCK
+            zeros = base.ljust(min(len(new), end), b"\0")
+            return zeros if data is Data.ZEROS else zeros + new[end:]
         if data is Data.HALF:
             *whole, (offset, last) = rest[: (len(rest) + 1) // 2]
             cut_off = last if last is None else last[: len(last) // 2]
@@ -180,7 +184,9 @@ class Disk:
             node.floors.clear()
         number = len(self._names) - 1
         if self._kind is FileSystem.XFS:
-            inside = [self._directories.get(path, 0) for path, one in self.names.items() if one is node]
+            inside = [
+                self._directories.get(path, 0) for path, one in self.names.items() if one is node
+            ]
             number = max([node.named, *inside])
         self._forced = max(self._forced, number)
 
@@ -234,7 +240,7 @@ class Disk:
     def _state(self, cut: int, data: Data, draw: random.Random) -> State:
         names = self._names[cut]
         unsynced = [path for path, node in names.items() if node.pending]
-        other = draw.choice(unsynced) if unsynced and draw.random() < 0.5 else ""
+        other = draw.choice(unsynced) if len(unsynced) > 1 and draw.random() < 0.5 else ""
         opposite = Data.ALL if data is not Data.ALL else draw.choice(list(Data)[:-1])
         entries: dict[str, bytes | str | None] = {}
         for path, node in names.items():

@@ -109,7 +109,7 @@ class Oracle:
             elif found != self._first[name]:
                 yield f"{name} runs with other files: {found}, not {self._first[name]}"
 
-    def _archive(self, state: State) -> Iterator[str]:
+    def _archive(self, _: State) -> Iterator[str]:
         """Continue each stored log as a collector does, and compare it with the log itself."""
         directory = self._root / "archive"
         writer = ArchiveWriter(directory, ArchiveLimits(keep=1 << 40, keep_host=1 << 40))
@@ -120,7 +120,13 @@ class Oracle:
                 yield f"{position} bytes of {source.process} are stored, and it wrote {len(log)}"
                 continue
             part = LogPart(
-                source.number, [source.number], log[position:], position, len(log), ended=True, marks=()
+                source.number,
+                [source.number],
+                log[position:],
+                position,
+                len(log),
+                ended=True,
+                marks=(),
             )
             writer.add(source, part)
             stored = LogArchive(directory).read_log(*source, 0, len(log)).content

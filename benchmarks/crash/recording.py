@@ -114,12 +114,8 @@ class Recording:
 
     def _attributes(self) -> dict[int, Attributes]:
         """Return those of each inode that is there now."""
-        found = {}
-        for folder, _, files in os.walk(self.root):
-            for path in (folder, *(os.path.join(folder, name) for name in files)):
-                one = os.lstat(path)
-                found[one.st_ino] = Attributes(stat.S_IMODE(one.st_mode), one.st_mtime_ns)
-        return found
+        found = (path.lstat() for path in self.root.rglob("*"))
+        return {one.st_ino: Attributes(stat.S_IMODE(one.st_mode), one.st_mtime_ns) for one in found}
 
     def _below(self, path: str) -> str:
         return os.path.relpath(os.path.normpath(path), self.root) if path else ""

@@ -2,8 +2,9 @@
 
 Bytes are appended only at the end of the stored log of a source, and that end is read from the
 file. So a crash at any moment loses no byte and stores none twice: the collector requests bytes
-again that were not written. Appended bytes are forced to the disk, because a loss of power may
-leave the size of a file without its newest bytes.
+again that were not written. A loss of power may leave the size of a file, or its newest blocks,
+without the bytes before: zeros. So appended bytes are forced to the disk, and zeros among the last
+ones are dropped at the start.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from rosrm.supervisor.log_index import Mark
 
 #: Bytes of a segment, or of its index, beyond which it is closed.
 SEGMENT_BYTES: Final = 4 << 20
+#: Most bytes of a part of a log, as a slave sends it.
+_LONGEST_APPEND: Final = 1 << 20
 #: Part of the bound that may be written until the bounds are applied.
 _EXCESS_PART: Final = 64
 #: Empty segments, which remember the positions of sources whose logs were removed.
@@ -56,6 +59,7 @@ class ArchiveWriter:
         self._directory, self._limits = directory, limits
         self.read_again()
         self._remove_remains()
+        self._drop_zeros()
 
     def read_again(self) -> None:
         """Read the segments again, e.g. after a user removed files; raises `OSError`."""
@@ -211,6 +215,21 @@ class ArchiveWriter:
         for file in self._directory.glob("hosts/*/*"):
             if file not in expected and is_own_name(file.name):
                 file.unlink()
+
+    def _drop_zeros(self) -> None:
+        """Cut each open segment at zeros of its last append; the host sends what was there again.
+
+        Output that has zeros itself is sent again, too.
+        """
+        for source, segment in list(self._stored()):
+            begin = max(segment.begin, segment.end - _LONGEST_APPEND) - segment.begin
+            if segment.is_open and segment.end > segment.begin:
+                with os.fdopen(open_private(str(segment.path), os.O_RDWR), "rb+") as file:
+                    file.seek(begin)
+                    zero = file.read().find(b"\0")
+                    if zero >= 0:
+                        file.truncate(begin + zero)
+                self._refresh(source, segment)
 
 
 def _add_marks(segment: Segment, part: LogPart) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -123,8 +122,7 @@ class SqliteJournal:
         new = f"{self._path}.new"
         # Of a start that was cut, or of a journal that was moved away without its log.
         for left in (new, f"{new}-journal", f"{self._path}-wal", f"{self._path}-shm"):
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(left)
+            Path(left).unlink(missing_ok=True)
         with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as database:
             database.executescript(f"BEGIN; {_TABLES}; PRAGMA user_version={SCHEMA}; COMMIT;")
         make_private_file(new)

@@ -206,6 +206,20 @@ def test_a_host_that_has_lost_its_newest_bytes_doubles_nothing(rig):
     assert rig.chunks() == [(0, b"one\ntwo\nthree\n")]
 
 
+@pytest.mark.parametrize("lost", [slice(8, 14), slice(8, 11)], ids=["all", "a block"])
+def test_a_loss_of_power_during_an_append_leaves_no_zeros_and_doubles_nothing(rig, lost):
+    """Size or further blocks may be there without the bytes before them."""
+    rig.alpha.write(b"one\ntwo\nthree\n")
+    rig.collect()
+    (path,) = rig.directory.glob("hosts/*/*.log")
+    content = bytearray(path.read_bytes())
+    content[lost] = bytes(lost.stop - lost.start)
+    path.write_bytes(content)
+    rig.start()
+    rig.collect()
+    assert rig.chunks() == [(0, b"one\ntwo\nthree\n")]
+
+
 def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig, monkeypatch):
     rig.alpha.write(b"one\n")
     rig.master.silent.add(HOST)
