@@ -7,7 +7,7 @@ ARGS   ?=
 
 SHELL := /bin/bash
 BIN   := .venv/bin
-BENCHMARKS := decide latency throughput command startup apply slave_cost keep_cost balance handoff scale restart sealed simulation transfer start_cost web criu soak
+BENCHMARKS := decide latency throughput command startup apply slave_cost keep_cost balance handoff scale restart sealed simulation transfer start_cost web criu soak crash
 
 # .venv is complete in itself. What another environment left behind (a sourced ROS 2, or the
 # bootstrapper of the ROS wheels in another virtual environment) would mix its libraries with these.

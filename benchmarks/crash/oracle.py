@@ -71,7 +71,7 @@ class Oracle:
         for name in _told(state, "revoked"):
             if name in valid:
                 yield f"the key of {name} is valid again"
-        for name in _told(state, "added") - _told(state, "revoked"):
+        for name in _told(state, "added") - _told(state, "revoking"):
             if secret is None or name not in valid:
                 yield f"the key of {name} is not valid any more"
 

@@ -103,6 +103,7 @@ class Scenario:
             out = self._cluster.directory / f"robot-{number}.key"
             self._command("key", "add", name, "--out", str(out))
             self._recording.mark(f"added {name}")
+        self._recording.mark("revoking host:robot-1")
         self._command("key", "revoke", "host:robot-1")
         self._recording.mark("revoked host:robot-1")
 

@@ -24,6 +24,7 @@ from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record
 from rosrm.runtime.disk_space import room_for
+from rosrm.runtime.durable import rename_durably
 from rosrm.wording import counted, reason_of
 
 _BESIDE: Final = ("-wal", "-shm")
@@ -90,7 +91,7 @@ def _recover(path: Path, wall: Callable[[], float]) -> str:
         for suffix in _BESIDE:
             with contextlib.suppress(FileNotFoundError):
                 Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
-        new.replace(path)
+        rename_durably(str(new), str(path))
     return _summary(found, str(aside))
 
 
