@@ -18,6 +18,7 @@ from tests.pages import PYTHON, ROOT, blocks, run_examples
 PUBLIC = ("rosrm.node", "rosrm.testing")
 #: Programs of this repository that need more names.
 MORE = {
+    "plugins/container/rosrm_container/podman.py": {"rosrm.shortage"},
     "plugins/migration/rosrm_migration/handoff.py": {"rosrm.ros.slave.publisher_watch"},
     "examples/rosrm_examples/demo_job.py": {"rosrm.config.settings"},
     "examples/rosrm_examples/demo_run.py": {"rosrm.supervisor.client"},
@@ -46,6 +47,7 @@ OF_CRIU = {
     "rosrm.runtime.disk_space",
     "rosrm.runtime.log_tail",
     "rosrm.runtime.signalling",
+    "rosrm.shortage",
     "rosrm.supervisor",
     "rosrm.supervisor.procfs",
     "rosrm.supervisor.spawn",
