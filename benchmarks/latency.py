@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.hosts import three_hosts
+from benchmarks.hosts import add_sync, three_hosts, with_journal
 from benchmarks.machine import parser, print_report, say
 from benchmarks.peers.work import STAMP
 from benchmarks.stopping import run
@@ -88,10 +88,12 @@ def main() -> None:
     command_line.add_argument(
         "--trace", action="store_true", help="trace each start, and report its hand-overs"
     )
+    add_sync(command_line)
     arguments = command_line.parse_args()
     with tempfile.TemporaryDirectory(prefix="rosrm-latency-") as folder:
         directory = Path(folder)
-        with LocalCluster(directory, hosts=three_hosts()) as cluster:
+        settings = with_journal(arguments.sync)
+        with LocalCluster(directory, cluster=settings, hosts=three_hosts()) as cluster:
             spawns, totals, traces = list[float](), list[float](), list[Trace]()
             for number in range(arguments.warm_up + arguments.runs):
                 # Interleaved: other load on the machine affects both alike.
@@ -108,6 +110,7 @@ def main() -> None:
     print_report(
         "latency",
         {
+            "sync": arguments.sync,
             "p50_ms": float(np.percentile(totals, 50)),
             "p99_ms": float(np.percentile(totals, 99)),
             "spawn_p50_ms": float(np.percentile(spawns, 50)),

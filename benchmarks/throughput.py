@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks.hosts import three_hosts
+from benchmarks.hosts import Sync, add_sync, three_hosts, with_journal
 from benchmarks.machine import parser, print_report
 from benchmarks.stopping import run
 from rosrm.config.settings import HostConfig
@@ -55,11 +55,13 @@ def wait_for_all(
         cluster.client.spin(0.02)
 
 
-def measure(hosts: Sequence[HostConfig], specs: Sequence[ProcessSpec]) -> float:
+def measure(
+    hosts: Sequence[HostConfig], specs: Sequence[ProcessSpec], sync: Sync = "normal"
+) -> float:
     """Return the makespan on a fresh cluster, after a warm-up of thirty jobs."""
     with (
         tempfile.TemporaryDirectory(prefix="rosrm-throughput-") as folder,
-        LocalCluster(Path(folder), hosts=hosts) as cluster,
+        LocalCluster(Path(folder), cluster=with_journal(sync), hosts=hosts) as cluster,
     ):
         makespan(cluster, [_job(f"warm{i}", "true") for i in range(30)])
         return makespan(cluster, specs)
@@ -73,18 +75,20 @@ def main() -> None:
     """Measure and print one JSON object."""
     command_line = parser(__doc__)
     command_line.add_argument("--runs", type=int, default=5, help="clusters for each measurement")
-    runs = command_line.parse_args().runs
+    add_sync(command_line)
+    arguments = command_line.parse_args()
+    runs, sync = arguments.runs, arguments.sync
     jobs = [_job(f"true{i}", "true") for i in range(_TRUE)]
     sleeps = [_job(f"sleep{i}", "sleep", str(_SLEEP_S)) for i in range(_SLEEPS)]
     ideal = _SLEEPS / 3 * _SLEEP_S
     rates, ratios = [], []
     for _ in range(runs):
-        rates.append(_TRUE / measure(three_hosts(), jobs))
-        ratios.append(measure(three_hosts(max_processes=1), sleeps) / ideal)
+        rates.append(_TRUE / measure(three_hosts(), jobs, sync))
+        ratios.append(measure(three_hosts(max_processes=1), sleeps, sync) / ideal)
     print_report(
         "throughput",
         {
-            "jobs_per_s": statistics.median(rates), "jobs_per_s_all": rates,
+            "sync": sync, "jobs_per_s": statistics.median(rates), "jobs_per_s_all": rates,
             "makespan_over_ideal": statistics.median(ratios), "makespan_over_ideal_all": ratios,
         },
         runs=runs,

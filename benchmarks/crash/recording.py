@@ -49,6 +49,15 @@ class Attributes:
     modified_ns: int
 
 
+def compiled(source: Path, folder: Path) -> Path:
+    """Compile a library for `LD_PRELOAD` into a folder, and return its path."""
+    library = folder / source.with_suffix(".so").name
+    compiler = sysconfig.get_config_var("CC").split()
+    words = [*compiler, "-shared", "-fPIC", "-O1", "-o", str(library), str(source), "-ldl"]
+    subprocess.run(words, check=True)
+    return library
+
+
 class Recording:
     """Recorder of the processes that inherit `environment`.
 
@@ -63,10 +72,8 @@ class Recording:
     def __init__(self, root: Path, folder: Path) -> None:
         self.root = root
         self.attributes: Mapping[int, Attributes] = {}
-        self._log, library = folder / "calls", folder / "recorder.so"
-        compiler = sysconfig.get_config_var("CC").split()
-        words = [*compiler, "-shared", "-fPIC", "-O1", "-o", str(library), str(_SOURCE), "-ldl"]
-        subprocess.run(words, check=True)
+        self._log = folder / "calls"
+        library = compiled(_SOURCE, folder)
         root.mkdir()
         self._log.touch()
         self.environment = {

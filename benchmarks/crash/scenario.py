@@ -8,14 +8,15 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from benchmarks.crash.recording import Recording
+from benchmarks.hosts import with_journal
 from rosrm.client.client import Client
 from rosrm.client.waiting import Until
-from rosrm.config.settings import ClusterConfig, HostConfig
+from rosrm.config.settings import HostConfig
 from rosrm.testing.local_cluster import LocalCluster
 
 HOST: Final = "host0"
@@ -178,8 +179,6 @@ def record(folder: Path) -> tuple[Recording, Path]:
     recording, places = Recording(folder / "disk", folder), Places.make(folder)
     recording.make("cluster/", "cluster/master.log", f"cluster/{HOST}.log")  # for their output
     keys = {"ROSRM_KEYS": str(recording.root / "keys")}
-    settings = ClusterConfig()
-    settings = replace(settings, journal=replace(settings.journal, sync="full"))
     hosts = [
         HostConfig(
             host=HOST, scope="slice", max_processes=3,
@@ -188,7 +187,9 @@ def record(folder: Path) -> tuple[Recording, Path]:
     ]  # fmt: skip
     with (
         _variables({**recording.environment, **keys}),
-        LocalCluster(recording.root / "cluster", cluster=settings, hosts=hosts) as cluster,
+        LocalCluster(
+            recording.root / "cluster", cluster=with_journal("full"), hosts=hosts
+        ) as cluster,
     ):
         cluster.wait_for_hosts(_PATIENCE)
         Scenario(recording, cluster, places).play()
