@@ -84,11 +84,16 @@ class Oracle:
             return
         with contextlib.closing(journal):
             phases = {name: one["phase"] for name, one in journal.intents("process").items()}
+            wanted = {one["wanted"] for one in journal.intents("application").values()}
         for name in _told(state, "submitted") - phases.keys():
             yield f"{name} was accepted, and is not known"
         for name in _told(state, "ended"):
             if phases.get(name) not in _ENDED:
                 yield f"{name} has ended, and is {phases.get(name)}"
+
+        applied = max(map(int, _told(state, "applied")), default=0)
+        if applied > max(wanted, default=0):
+            yield f"version {applied} was applied, and {wanted} is wanted"
 
     def _host(self, state: State) -> Iterator[str]:
         supervisor = self._root / "cluster" / "hosts" / HOST / "supervisor"

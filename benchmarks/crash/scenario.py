@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,10 +17,14 @@ from benchmarks.hosts import with_journal
 from rosrm.client.client import Client
 from rosrm.client.waiting import Until
 from rosrm.config.settings import HostConfig
+from rosrm.config.work import processes_of
+from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.testing.local_cluster import LocalCluster
 
 HOST: Final = "host0"
 _PATIENCE: Final = 120.0
+_APPLICATION: Final = "map"
+_QUICK: Final = RolloutPolicy(healthy_for=0.5)
 #: Program of each process: it tells what it found, and a service runs on.
 _PROGRAM: Final = """#!/bin/sh
 name=${ROSRM_INSTANCE%%#*} then=$1 effects=$2 artifact=$3
@@ -95,6 +99,7 @@ class Scenario:
         self._jobs(1)  # from which the master learns that they are short
         self._jobs(8)  # of which the host holds one ahead
         self._nodes()
+        self._versions()
         self._restarts()
         self._stops()
 
@@ -121,6 +126,14 @@ class Scenario:
         self._submit(nodes)
         for node in nodes:
             self._wait(node["name"], "runs")
+
+    def _versions(self) -> None:
+        for version in (1, 2):
+            (spec,) = processes_of(self._places.process("planner", then=f"run-{version}"))
+            spec = replace(spec, application=_APPLICATION)
+            self._client.apply_targets([Target(_APPLICATION, (spec,), rollout=_QUICK)])
+            self._recording.mark(f"applied {version}")
+            self._client.wait_for_applications(_APPLICATION, timeout=_PATIENCE)
 
     def _restarts(self) -> None:
         master = self._cluster.master
@@ -181,7 +194,7 @@ def record(folder: Path) -> tuple[Recording, Path]:
     keys = {"ROSRM_KEYS": str(recording.root / "keys")}
     hosts = [
         HostConfig(
-            host=HOST, scope="slice", max_processes=3,
+            host=HOST, scope="slice", max_processes=4,
             budget={"memory": 2.0**34, "cpu": 64.0}, probes={"memory": {}, "cpu": {}},
         )
     ]  # fmt: skip
