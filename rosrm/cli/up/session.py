@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
@@ -17,13 +19,15 @@ from rosrm.cli.output.tables import event_line
 from rosrm.cli.process import INTERRUPTED
 from rosrm.cli.up.cluster import UpCluster
 from rosrm.client.waiting import ENDED
-from rosrm.errors import NoMaster, Refused, RosrmError
+from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError
 from rosrm.model.applications import Target
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow
 from rosrm.model.values import ProcessSpec
+from rosrm.ros.spec_digests import digest_of
 from rosrm.runtime.dispositions import handled
-from rosrm.wording import amount, counted, first_line, listed
+from rosrm.runtime.durable import replace_durably
+from rosrm.wording import amount, counted, first_line, listed, reason_of
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -32,6 +36,8 @@ if TYPE_CHECKING:
 _PERIOD: Final = 0.3
 #: Number of events in one listing that leaves out none, as in `List.srv`.
 _ALL_NEW: Final = 2**32 - 1
+#: File of the digests of submitted specs in the state directory: a changed job runs again.
+_RECORD: Final = "submitted.json"
 #: Kinds of events that are shown: starts and ends of processes, moves, and problems.
 _SHOWN: Final = frozenset({
     EventKind.READY, EventKind.RUNNING, EventKind.REACHABLE, EventKind.BACKOFF, EventKind.FINISHED,
@@ -163,12 +169,32 @@ def _submit(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
     if not specs:
         return
     rows = cluster.client.list(processes=True).processes
-    known = {row.name for row in rows if row.state not in ENDED}
-    new = [spec for spec in specs if spec.name not in known]
-    if len(new) < len(specs):
-        _say(f"{counted(len(specs) - len(new), 'process', 'processes')} queued or running already")
+    alive = {row.name for row in rows if row.state not in ENDED}
+    finished = {row.name for row in rows if row.state == "finished" and row.kind == "job"}
+    record = cluster.directory / _RECORD
+    former = _read_record(record)
+    digests = {spec.name: digest_of(spec) for spec in specs}
+    done = {name for name in finished if former.get(name, "") == digests.get(name)}
+    new = [spec for spec in specs if spec.name not in alive | done]
+    for names, what in ((alive, "queued or running already"), (done, "finished already")):
+        if known := names & digests.keys():
+            _say(f"{counted(len(known), 'process', 'processes')} {what}")
     if new:
         _say(cluster.client.submit(new))
+        content = json.dumps(former | {spec.name: digests[spec.name] for spec in new})
+        replace_durably(str(record), content.encode())
+
+
+def _read_record(path: Path) -> dict[str, str]:
+    """Return the digests of the specs that were submitted last; {}: none are known."""
+    try:
+        return dict(json.loads(path.read_bytes()))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, TypeError) as error:
+        raise ConfigError(
+            f"{path}: {reason_of(error)}; remove the file, and finished jobs run again"
+        ) from None
 
 
 def _new_events(cluster: UpCluster, after: int) -> Sequence[EventRow]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,8 +14,9 @@ from rosrm.errors import ConfigError
 from rosrm.extensions.contracts import ProbeOffer
 from rosrm.extensions.registry import Registry
 from rosrm.model.ros_settings import RosSettings
-from rosrm.model.values import Reading, ResourceDescription
+from rosrm.model.values import ProcessSpec, Reading, ResourceDescription
 from tests.plugin_kit import plugin
+from tests.unit.cli.conftest import FakeClient, process
 
 
 def probe(name, capacity, usage):
@@ -125,3 +127,39 @@ def test_a_missing_temporary_directory_is_said(monkeypatch, tmp_path):
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
     with pytest.raises(ConfigError, match=r"no temporary directory for the state: .*--state DIR"):
         up._temporary_directory()
+
+
+def submitted(cluster, *specs):
+    """Return the names that one start of `rosrm up` submits."""
+    cluster.client.asked.clear()
+    session._submit(cluster, specs)
+    return [name for what, *given in cluster.client.asked if what == "submit" for name in given[0]]
+
+
+@pytest.mark.parametrize(
+    ("kind", "state", "again"),
+    [
+        ("job", "finished", False), ("job", "failed", True), ("job", "cancelled", True),
+        ("service", "finished", True), ("job", "queued", False), ("service", "running", False),
+    ],
+)  # fmt: skip
+def test_a_kept_directory_runs_no_finished_job_again(tmp_path, capsys, kind, state, again):
+    """As `rosrm apply` does: failed and cancelled processes start again, and changed jobs."""
+    cluster = SimpleNamespace(client=FakeClient(processes=[]), directory=tmp_path)
+    spec = ProcessSpec("pick", kind=kind, command=("true",))
+    assert submitted(cluster, spec) == ["pick"]
+    cluster.client.processes = [process("pick", state, kind=kind)]
+    assert submitted(cluster, spec) == ["pick"] * again
+    if state == "finished" and not again:
+        assert "1 process finished already" in capsys.readouterr().out
+        changed = replace(spec, command=("false",))
+        assert submitted(cluster, changed) == ["pick"]
+        assert submitted(cluster, changed) == []
+
+
+def test_a_damaged_record_of_submitted_jobs_is_named(tmp_path):
+    """Jobs of unknown entries would run again without a word."""
+    (tmp_path / "submitted.json").write_text("[", encoding="utf-8")
+    cluster = SimpleNamespace(client=FakeClient(processes=[]), directory=tmp_path)
+    with pytest.raises(ConfigError, match=r"submitted\.json: .*; remove the file"):
+        submitted(cluster, ProcessSpec("pick", command=("true",)))
