@@ -143,6 +143,8 @@ class Watcher:
                 for key in keys
             ]  # fmt: skip
         config = _read(self._configs[name], data)
+        if config is None:
+            return
         if config.channel not in self._channels:
             self._channels.add(config.channel)
             self._listen_to(config)
@@ -155,13 +157,13 @@ class Watcher:
         reports = SealedTopic(link, name, HandoffReport, config.channel)
         reports.subscription(self._node, HANDOFF, lambda data: self._reported(reports.read(data)))
 
-    def _reported(self, report: HandoffReport) -> None:
-        if report.instance >= self._source:
+    def _reported(self, report: HandoffReport | None) -> None:
+        if report is not None and report.instance >= self._source:
             self._hear(REPORTED[report.phase])
 
     def _told(self, data: bytes) -> None:
         batch = _read(self._statuses, data)
-        for status in batch.statuses:
+        for status in batch.statuses if batch else ():
             self._is(status, repeats=batch.complete)
 
     def _is(self, status: ProcessStatus, *, repeats: bool) -> None:
@@ -191,8 +193,11 @@ class Watcher:
 
 
 def _read(topics: list[SealedTopic], data: bytes) -> Any:
-    """Return the message that one of the topics opens."""
-    return next(found for topic in topics if (found := topic.read(data)) is not None)
+    """Return the message that one of the topics opens; None: it has been read already.
+
+    A busy machine may lose and find a participant, whose newest message then comes once more.
+    """
+    return next((found for topic in topics if (found := topic.read(data)) is not None), None)
 
 
 def blocks(outputs: list[Output]) -> list[list[Output]]:
