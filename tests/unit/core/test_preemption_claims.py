@@ -182,4 +182,4 @@ class Claims(RuleBasedStateMachine):
 
 
 TestClaims = Claims.TestCase
-TestClaims.settings = settings(max_examples=100, stateful_step_count=20, deadline=None)
+TestClaims.settings = settings(max_examples=50, stateful_step_count=20, deadline=None)
