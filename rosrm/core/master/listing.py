@@ -325,25 +325,23 @@ def _advice(state: MasterState, process: Process) -> str:
         end = f"`rosrm cancel {process.name}` ends its schedule"
         return f"{logs}, {now}, {end}" if process.ended_on else f"{now}, {end}"
     if process.phase is ProcessPhase.FAILED:
-        again = (
-            f"`rosrm restart {process.name}` starts it again, `rosrm submit FILE` replaces it by a "
-            f"corrected one"
-        )
+        change = _advice_to_change(state, process, "to correct it")
+        again = f"`rosrm restart {process.name}` starts it again; {change}"
         return f"{logs}, {again}" if process.ended_on else again
     again = _advice_to_try_again(process) if process.phase in WAITING else ""
     if process.phase is ProcessPhase.SET_ASIDE:
-        aside = (
-            f"it is queued again when such a host registers; {_advice_to_change(state, process)}"
-        )
+        change = _advice_to_change(state, process, "to change what it needs")
+        aside = f"it is queued again when such a host registers; {change}"
         return f"{aside}; {again}" if again else aside
     return again
 
 
-def _advice_to_change(state: MasterState, process: Process) -> str:
-    """Return how to change the needs of a process that is set aside, with all of its gang."""
-    aim = "to change what it needs"
+def _advice_to_change(state: MasterState, process: Process, aim: str) -> str:
+    """Return how to change the spec of a process that has failed or waits, with all of its gang."""
     if process.spec.application:
         return f"{aim}, change its file and `rosrm apply` it again"
+    if process.phase.is_terminal:  # names that are in use are refused
+        return f"{aim}, `rosrm submit` a file with this process alone"
     gang = state.gangs.of(process)
     names = " ".join(gang) if len(gang) <= _MOST_NAMED else "FILE"
     them = "it" if len(gang) == 1 else f"all of the gang {process.spec.together}"

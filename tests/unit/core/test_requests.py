@@ -609,12 +609,27 @@ def test_an_explanation_has_the_next_command() -> None:
     For an unreachable one it names the slave to start.
     """
     cluster = Cluster("a")
-    cluster.submit(process("p", restart=RestartPolicy("never")), process("q"))
+    failing = process("p", restart=RestartPolicy("never"))
+    cluster.submit(failing, process("q"))
     cluster.finish("p", code=2)
     assert cluster.explain("p")["reason"] == "exit code 2"
     assert cluster.explain("p")["advice"] == (
-        "`rosrm logs p` shows its output, `rosrm restart p` starts it again, "
-        "`rosrm submit FILE` replaces it by a corrected one"
+        "`rosrm logs p` shows its output, `rosrm restart p` starts it again; "
+        "to correct it, `rosrm submit` a file with this process alone"
     )
+    assert not cluster.submit(failing, process("q")).accepted
+    assert cluster.submit(failing).accepted
     cluster.detach("a")
     assert cluster.explain("q")["advice"] == "start the slave of a again"
+
+
+def test_the_advice_for_a_failed_part_of_an_application_names_apply() -> None:
+    """The master refuses its submission."""
+    cluster = Cluster("a")
+    part = process("p", restart=RestartPolicy("never"))
+    cluster.apply("nav", part)
+    cluster.finish("p", code=2)
+    assert not cluster.submit(replace(part, application="nav")).accepted
+    assert cluster.explain("p")["advice"].endswith(
+        "to correct it, change its file and `rosrm apply` it again"
+    )
