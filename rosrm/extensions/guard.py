@@ -21,7 +21,8 @@ from rosrm.wording import listed
 T = TypeVar("T")
 
 #: Time-out of the import of a plugin, of a hook and of `create`; seconds. Below the lease of a
-#: host, because a slave that restarts loads its plugins before it renews the lease.
+#: host, because a slave that restarts loads its plugins before it renews the lease. (A slave does
+#: not wait that long for `create`, see `rosrm.slave.plugin_creation`.)
 LOADING_LIMIT: Final = 8.0
 
 

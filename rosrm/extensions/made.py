@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -60,6 +60,21 @@ class MadeProbe:
 
 
 @dataclass(frozen=True)
+class DraftedProbe:
+    """A created probe with its own description, before the comparison with the other probes.
+
+    Attributes:
+        measures: it measures how much single processes use.
+    """
+
+    offer: ProbeOffer
+    probe: Probe
+    resources: tuple[ResourceDescription, ...]
+    labels: Mapping[str, str]
+    measures: bool
+
+
+@dataclass(frozen=True)
 class Probes:
     """The probes of a host.
 
@@ -77,15 +92,69 @@ class Probes:
         return {key: value for one in self.made for key, value in one.labels.items()}
 
 
+class ProbeList:
+    """The probes of a host while they are created, in any order.
+
+    Args:
+        offers: of the wanted probes, by name.
+        awaited: returns why a probe that is not created yet cannot be read.
+    """
+
+    def __init__(self, offers: Mapping[str, ProbeOffer], awaited: Callable[[str], str]) -> None:
+        self._offers, self._awaited = offers, awaited
+        self._made: list[MadeProbe] = []
+        self._absent: dict[str, str] = {}
+        self._failed = dict.fromkeys(offers, "")  # "": not created yet
+
+    def fault_of(self, drafted: DraftedProbe) -> str:
+        """Return why the host cannot have a probe beside those that were added, as a predicate.
+
+        "": it can.
+        """
+        return (
+            fault_of_resources(drafted.resources, drafted.offer, self._made)
+            or unmeasured(drafted.resources, measures=drafted.measures)
+            or fault_of_labels(drafted.labels, self._made)
+        )
+
+    def add(self, drafted: DraftedProbe) -> None:
+        """Add a probe without a fault."""
+        offer = drafted.offer
+        del self._failed[offer.name]
+        self._made.append(
+            MadeProbe(
+                offer.name, drafted.probe, drafted.resources, offer.period, offer.deadline,
+                dict(drafted.labels),
+            )
+        )  # fmt: skip
+
+    def leave_out(self, name: str, reason: str) -> None:
+        """Note that a probe is absent on this host."""
+        del self._failed[name]
+        self._absent[name] = reason
+
+    def fail(self, name: str, reason: str) -> None:
+        """Note why a probe could not be created."""
+        self._failed[name] = reason
+
+    @property
+    def probes(self) -> Probes:
+        """Return the added probes, and a `FailedProbe` for each other one that is not absent."""
+        made = list(self._made)
+        for name, reason in self._failed.items():
+            made.append(failed_probe(self._offers[name], reason or self._awaited(name), made))
+        return Probes(tuple(made), dict(self._absent))
+
+
 class FailedProbe:
-    """Substitute for a chosen probe that could not be created; each read fails with the reason.
+    """Substitute for a chosen probe that is not, or not yet, created; each read fails.
 
     So its resources are stale, and the host gets no new work if one of them has a limit, as after a
     failed read of a probe.
 
     Attributes:
         resources: resources that the offer declares and no other probe reads, of unknown capacity.
-        reason: why the probe could not be created, with the plugin and the place.
+        reason: why there is no probe, with the plugin and the place.
     """
 
     def __init__(self, resources: Sequence[ResourceDescription], reason: str) -> None:
@@ -228,9 +297,9 @@ def _is_text(word: object) -> bool:
     return isinstance(word, str) and word.isprintable() and len(word) <= _LONGEST_LABEL
 
 
-def unmeasured(probe: object, resources: Sequence[ResourceDescription]) -> str:
+def unmeasured(resources: Sequence[ResourceDescription], *, measures: bool) -> str:
     """Return the fault of a probe that does not measure an attributed resource; "" for none."""
-    if hasattr(probe, "by_process"):
+    if measures:
         return ""
     attributed = [
         one.name

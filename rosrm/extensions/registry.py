@@ -52,19 +52,16 @@ from rosrm.extensions.guard import Crash, guarded, limit_of_one_call, note_versi
 from rosrm.extensions.guarded_sink import GuardedSink
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.extensions.made import (
+    DraftedProbe,
     MadeLauncher,
     MadeLaunchers,
-    MadeProbe,
     OfferedExecutor,
+    ProbeList,
     Probes,
     close_quietly,
-    failed_probe,
-    fault_of_labels,
-    fault_of_resources,
     missing_method,
     taken_labels,
     taken_resources,
-    unmeasured,
 )
 from rosrm.extensions.options import merged_options
 from rosrm.extensions.placement import ScoringLink, SelectedFilter
@@ -76,7 +73,6 @@ from rosrm.model.values import (
     EMPTY,
     MigrationPolicy,
     ProcessSpec,
-    ResourceDescription,
 )
 from rosrm.wording import counted, get_close_matches, sanitized
 
@@ -376,16 +372,28 @@ class Registry:
         absent: dict[str, str] = {}
         broken: dict[str, str] = {}
         for name in self.names("launcher"):
-            offer = cast(LauncherOffer, self._offered("launcher", name).offer)
             try:
-                launcher = self._create("launcher", name, offer, context)
-                made[name] = MadeLauncher(launcher, tuple(offer.variables))
+                made[name] = self.launcher(name, context)
             except SkipPlugin as skip:
                 absent[name] = str(skip)
-                self._outcome["launcher", name] = ("absent", str(skip))
             except PluginError as fault:
                 broken[name] = str(fault)
         return MadeLaunchers(made, absent, broken)
+
+    def launcher(self, name: str, context: LauncherContext) -> MadeLauncher:
+        """Create a launcher; may be called in any thread.
+
+        Raises:
+            SkipPlugin: it is absent on this host.
+            PluginError: it cannot be created.
+        """
+        offer = cast(LauncherOffer, self._offered("launcher", name).offer)
+        try:
+            launcher = self._create("launcher", name, offer, context)
+        except SkipPlugin as skip:
+            self._outcome["launcher", name] = ("absent", str(skip))
+            raise
+        return MadeLauncher(launcher, tuple(offer.variables))
 
     def executors(self, chosen: NameToOptions = EMPTY) -> dict[str, OfferedExecutor]:
         """Return the executors that plans may name on this host, from all migration offers.
@@ -430,54 +438,83 @@ class Registry:
         Raises:
             ConfigError: for an unknown name or option.
         """
-        made: list[MadeProbe] = []
-        absent: dict[str, str] = {}
-        failed: dict[str, str] = {}
-        for name, options in (self.default_probes() if chosen is None else chosen).items():
-            try:
-                made.append(self._probe(name, options, context, made))
-            except SkipPlugin as skip:
-                absent[name] = str(skip)
-                self._outcome["probe", name] = ("absent", str(skip))
-            except PluginError:
-                source, (_, reason) = (
-                    self._offers["probe", name].source,
-                    self._outcome["probe", name],
-                )
-                failed[name] = f"{source}: {reason}"
-        for name, reason in failed.items():
-            offer = cast(ProbeOffer, self.offer("probe", name))
-            made.append(failed_probe(offer, reason, made))
-        return Probes(tuple(made), absent)
+        wanted = self.chosen_probes(chosen)
+        listed = self.probe_list(wanted)
+        for name, options in wanted.items():
+            self.add_probe(listed, name, partial(self.draft_probe, name, options, context))
+        return listed.probes
 
-    def _probe(
-        self,
-        name: str,
-        options: Mapping[str, Any],
-        context: ProbeContext,
-        before: Sequence[MadeProbe],
-    ) -> MadeProbe:
+    def chosen_probes(self, chosen: NameToOptions | None) -> NameToOptions:
+        """Return the probes of a host with their options, the default ones for None.
+
+        Raises:
+            ConfigError: a probe is unknown, or none is installed.
+        """
+        wanted = self.default_probes() if chosen is None else chosen
+        for name in wanted:
+            self._offered("probe", name)
+        return wanted
+
+    def probe_list(self, wanted: Iterable[str]) -> ProbeList:
+        """Return a list to which each of these probes can be added when it is created."""
+        offers = {name: cast(ProbeOffer, self.offer("probe", name)) for name in wanted}
+        return ProbeList(offers, self._not_returned)
+
+    def _not_returned(self, name: str) -> str:
+        create = cast(ProbeOffer, self.offer("probe", name)).create
+        source = self._offers["probe", name].source
+        return f"{source}: `create` ({definition(create)}) has not returned yet"
+
+    def draft_probe(
+        self, name: str, options: Mapping[str, Any], context: ProbeContext
+    ) -> DraftedProbe:
+        """Create a probe and read its description; may be called in any thread.
+
+        Raises:
+            SkipPlugin: it is absent on this host.
+            ConfigError: an option is invalid.
+            PluginError: it cannot be created.
+        """
         offer = cast(ProbeOffer, self.offer("probe", name))
         probe = self._make("probe", name, options, context)
 
-        def described() -> tuple[tuple[ResourceDescription, ...], dict[str, str]]:
+        def described() -> DraftedProbe:
             resources = taken_resources(probe.resources)
             labels = taken_labels(probe.labels) if implements(probe, HostLabelling) else EMPTY
-            fault = (
-                fault_of_resources(resources, offer, before)
-                or unmeasured(probe, resources)
-                or fault_of_labels(labels, before)
-            )
-            if fault:
-                raise PluginError(f"{type(probe).__name__} ({definition(type(probe))}) {fault}")
-            return resources, dict(labels)
+            return DraftedProbe(offer, probe, resources, labels, hasattr(probe, "by_process"))
 
         try:
-            resources, labels = self._guarded("probe", name, "resources` or `labels", described)
+            return self._guarded("probe", name, "resources` or `labels", described)
         except PluginError:
             close_quietly(probe)
             raise
-        return MadeProbe(name, probe, resources, offer.period, offer.deadline, labels)
+
+    def add_probe(self, listed: ProbeList, name: str, draft: Callable[[], DraftedProbe]) -> None:
+        """Add a probe to the list, or the reason why there is none.
+
+        Args:
+            draft: returns the created probe, or raises as `draft_probe`.
+
+        Raises:
+            ConfigError: an option is invalid.
+        """
+        try:
+            drafted = draft()
+            try:
+                compared = partial(_fault_beside, listed, drafted)
+                fault = self._guarded("probe", name, "resources` or `labels", compared)
+                if fault:
+                    raise self._fault("probe", name, fault)
+            except PluginError:
+                close_quietly(drafted.probe)
+                raise
+            listed.add(drafted)
+        except SkipPlugin as skip:
+            listed.leave_out(name, str(skip))
+            self._outcome["probe", name] = ("absent", str(skip))
+        except PluginError:
+            reason = self._outcome["probe", name][1]
+            listed.fail(name, f"{self._offers['probe', name].source}: {reason}")
 
     def _guarded(
         self, kind: PluginKind, name: str, hook: str, call: Callable[[], T], lets: Answers = ()
@@ -616,6 +653,13 @@ class Registry:
             return note
         many = counted(others, "plugin is", "plugins are")
         return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
+
+
+def _fault_beside(listed: ProbeList, drafted: DraftedProbe) -> str:
+    """Return why a host cannot have a probe beside the others of the list; "": it can."""
+    fault = listed.fault_of(drafted)
+    kind = type(drafted.probe)
+    return f"{kind.__name__} ({definition(kind)}) {fault}" if fault else ""
 
 
 def _is_named_like(source: PluginSource, name: str) -> bool:

@@ -103,7 +103,10 @@ class EventKind(str, Enum):
     # --- hosts ---------------------------------------------------------------------------
 
     HOST_REGISTERED = "host_registered", "a host registered; facts: labels, resources and devices"
-    HOST_CHANGED = "host_changed", "the slave reports other labels of the host; facts: labels"
+    HOST_CHANGED = (
+        "host_changed",
+        "the slave describes its host in another way; facts: labels, resources, absent",
+    )
     HOST_REFUSED = "host_refused", "a host was not registered, with the reason"
     HOST_SUSPECT = "host_suspect", "the host is silent and gets no new work"
     HOST_BACK = "host_back", "a silent host reports again"

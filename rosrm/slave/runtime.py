@@ -9,7 +9,7 @@ import socket
 import sys
 from array import array
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -64,7 +64,7 @@ from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
 from rosrm.runtime.bootstrap import end_start, handle_signals
-from rosrm.runtime.path_calls import PathCalls, at, run_at_once
+from rosrm.runtime.path_calls import PathCalls, at
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
 from rosrm.runtime.state_lock import only_one
 from rosrm.slave.artifacts.service import ArtifactService
@@ -81,6 +81,7 @@ from rosrm.slave.launch.launchers import ASK_LIMIT, PREPARE_LIMIT, Launchers
 from rosrm.slave.launch.starter import Starter
 from rosrm.slave.links import LinkProber
 from rosrm.slave.logs import nothing_yet, read_log
+from rosrm.slave.plugin_creation import PluginCreation
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.slave.sampler import ProbeReport, Sample, Sampler
 from rosrm.slave.sessions import SessionTable
@@ -156,24 +157,26 @@ class SlaveRuntime:
                     config.state, "slave", code="name_taken", remedy="another `host:` and `state:`"
                 )
             )
-            offered = registry.launchers(
-                LauncherContext(config.state, sys.executable, self._incarnation)
-            )
-            self._calls = registry.calls
-            self._calls.limit = self._deadlines = Deadlines(ASK_LIMIT)
-            launchers = Launchers.of(offered, registry.capabilities_or_fault(), self._calls)
-            self._launchers = tuple(launchers.made)
-            sessions = SessionTable(launchers=launchers)
-            self._usage = UsageWatch(sessions, lambda one: self._supervisor.group_of(one))  # noqa: PLW0108 - made later
-            self._absent, first = self._open_probes(registry, sessions, opened)
-            self._devices = DeviceWatch(config.devices)
-            self._devices.look(self._sampler.devices, FileFaults(run_at_once, lambda: None))
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._settings_check.hang_up)
             opened.callback(self._settings_check.close)
+            self._calls = registry.calls
+            self._calls.limit = self._deadlines = Deadlines(ASK_LIMIT)
+            # Before any plugin, because fences end processes without it.
+            self._open_supervisor(opened)
+            self._launchers = launchers = Launchers(
+                capabilities_of=registry.capabilities_or_fault(), calls=self._calls,
+                awaited=frozenset(registry.names("launcher")),
+            )  # fmt: skip
+            sessions = SessionTable(launchers=launchers)
+            self._usage = UsageWatch(sessions, self._supervisor.group_of)
+            first = self._open_plugins(registry, sessions, opened)
+            self._paths = PathCalls("paths of users", self._post)
+            self._device_faults = FileFaults(self._paths.run, self._look_at_devices)
+            self._devices = DeviceWatch(config.devices)
+            self._devices.look(self._sampler.devices, self._device_faults)
             self._textfile = Textfile(config.textfile, config.host)
             opened.callback(self._textfile.remove)
-            self._open_supervisor(opened)
             graph = self._join_ros(opened)
             self._health = HealthWatch(self._participant, graph, sessions, launchers)
             self._clients = InstanceClients(self._participant)
@@ -183,7 +186,7 @@ class SlaveRuntime:
                 self._clients, self._take, self._filled, self._paths.run
             )
             self._note_probes(first)
-            self._note_broken(offered.broken)
+            self._note_broken()
             name = f"{self._participant.node.get_name()}_flows"
             self._flows = FlowSampler(lambda: self._participant.unwatched_node(name))
             self._links = LinkProber(
@@ -207,21 +210,39 @@ class SlaveRuntime:
 
     # --- the parts -----------------------------------------------------------------------
 
-    def _open_probes(
+    def _open_plugins(
         self, registry: Registry, sessions: SessionTable, opened: contextlib.ExitStack
-    ) -> tuple[Mapping[str, str], tuple[ProbeReport, ...]]:
-        """Read the probes once; return the absent ones with the reasons, and the reports."""
+    ) -> tuple[ProbeReport, ...]:
+        """Create the probes and launchers, and read the probes once; return the reports."""
         config = self._config
-        self._process = ProcessState()  # before the first read, which may change it
-        context = ProbeContext(config.scope, config.budget, config.state, sessions)
-        probes = registry.probes(config.probes, context)
-        self._sampler = Sampler(probes.made)
+        self._process = ProcessState()  # before the first of them, which may change it
+        self._creation = PluginCreation(
+            registry, config.probes,
+            ProbeContext(config.scope, config.budget, config.state, sessions),
+            LauncherContext(config.state, sys.executable, self._incarnation), self._launchers,
+        )  # fmt: skip
+        self._creation.wait(self._supervisor.renew, lambda: bool(self._stopping))
+        self._probes = self._creation.probes
+        self._sampler = Sampler(self._probes.made)
         opened.callback(self._sampler.close)
-        self._probe_labels = probes.labels
         self._limit = self._limits()
         first = self._sampler.first().reports
-        self._process.restore()  # before the supervisor and the processes get the environment
-        return probes.absent, first
+        self._supervisor.renew()
+        self._process.restore()  # before the processes get the environment
+        return first
+
+    def _take_late_plugins(self) -> None:
+        """Use the probes and launchers that were created since the start of the slave."""
+        if not self._creation.take_late():
+            return
+        self._probes = self._creation.probes
+        for former in self._sampler.rearrange(self._probes.made):
+            for name in [one.name for one in former.resources] or [former.name]:
+                self._endpoint.failing.pop(("probe", name), None)
+        self._usage.forget()
+        self._limit = self._limits()
+        self._collect_failing()
+        self._endpoint.describe_again(self._description())
 
     def _open_supervisor(self, opened: contextlib.ExitStack) -> None:
         self._supervisor = SupervisorLink(
@@ -238,9 +259,7 @@ class SlaveRuntime:
     def _join_ros(self, opened: contextlib.ExitStack) -> GraphWatch:
         """Create participant and endpoint; return the view of the ROS graph."""
         config = self._config
-        self._paths = PathCalls("paths of users", self._post)
         self._suspends = clocks.Suspends()
-        self._device_faults = FileFaults(self._paths.run, self._look_at_devices)
         self._participant = Participant(config.ros, slave_node(config.host), pace="steady")
         opened.callback(self._participant.close)
         self._endpoints = SealedEndpoints(self._participant, self._security)
@@ -251,9 +270,8 @@ class SlaveRuntime:
         )  # fmt: skip
         return GraphWatch(self._participant.node)
 
-    def _note_broken(self, launchers: Mapping[str, str]) -> None:
+    def _note_broken(self) -> None:
         """Log and report the plugins that are broken on this host from the start."""
-        self._broken_launchers = dict(launchers)
         self._collect_failing()
         for strategy, reason in self._executors.failing.items():
             _log.info("migration strategy %s is broken: %s", strategy, reason)
@@ -303,10 +321,10 @@ class SlaveRuntime:
         return HostDescription(
             name=config.host, incarnation=self._incarnation, hostname=socket.gethostname(),
             pid=os.getpid(), software_version=__version__,
-            labels={**self._probe_labels, **config.labels},
+            labels={**self._probes.labels, **config.labels},
             resources=tuple(self._sampler.resources), max_processes=config.max_processes,
-            period=config.period, executors=self._executors.names, absent=self._absent,
-            launchers=self._launchers,
+            period=config.period, executors=self._executors.names, absent=self._probes.absent,
+            launchers=tuple(self._launchers.made),
             unenforced=self._supervisor.unenforced, cpus=tuple(sorted(os.sched_getaffinity(0))),
             devices=self._devices.devices,
         )  # fmt: skip
@@ -387,6 +405,7 @@ class SlaveRuntime:
                 self._clients.expire(now)
                 guard.call(self._usage.look, now, self._sampler.by_process)
                 guard.call(self._note_calls, now)
+                guard.call(self._take_late_plugins)
                 guard.call(self._process.restore)
                 self._take(TimePassed())  # `_cycle` may be rare, and fences need this
             awaited = self._state.awaited_in_graph()
@@ -563,7 +582,7 @@ class SlaveRuntime:
         failing = self._endpoint.failing
         for plugin in [one for one in failing if one[0] != "probe"]:
             del failing[plugin]
-        failing.update({("launcher", name): why for name, why in self._broken_launchers.items()})
+        failing.update({("launcher", name): why for name, why in self._launchers.broken.items()})
         failing.update(self._executors.failing_plugins())
         failing.update({plugin: one.error for plugin, one in self._calls.failing.items()})
 

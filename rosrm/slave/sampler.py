@@ -39,7 +39,7 @@ from rosrm.errors import PluginError
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.plugin_calls import titled
 from rosrm.model.devices import Device
-from rosrm.model.values import EMPTY, MOST_USED, RESOURCE_SLOTS
+from rosrm.model.values import EMPTY, MOST_USED, RESOURCE_SLOTS, ResourceDescription
 from rosrm.slave.probe_reads import UsageByProcess, read_devices, read_processes, read_values
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ class Sampler:
     def __init__(
         self, probes: Sequence[MadeProbe], *, clock: Callable[[], float] = clocks.boot_time
     ) -> None:
-        self.resources: Final = tuple(resource for made in probes for resource in made.resources)
+        self.resources: tuple[ResourceDescription, ...] = ()
         self._clock = clock
         self._progress = threading.Event()
         self._shared = _Lane("rosrm-probes")
@@ -141,12 +141,40 @@ class Sampler:
         self._usage = [0.0] * RESOURCE_SLOTS
         self._by_process: dict[int, Mapping[int, float]] = {}
         self._devices: dict[str, tuple[Device, ...]] = {}
+        self.rearrange(probes)
+
+    def rearrange(self, probes: Sequence[MadeProbe]) -> tuple[MadeProbe, ...]:
+        """Read these probes from now on; return the former ones that are read no more.
+
+        A probe that stays keeps its readings, maybe in other slots; a new one is full and stale.
+        """
+        before = dict(zip((one.name for one in self.resources), self._usage, strict=False))
+        amounts = {self.resources[slot].name: one for slot, one in self._by_process.items()}
+        former = {id(watched.made): watched for watched in self._watched}
+        self.resources = tuple(resource for made in probes for resource in made.resources)
+        self._watched = [
+            former.pop(id(made))
+            if id(made) in former
+            else _Watched(made, self._clock, self._progress)
+            for made in probes
+        ]
         first = 0
-        for made in probes:
-            watched = _Watched(made, first, clock, self._progress)
-            self._watched.append(watched)
+        for watched in self._watched:
+            watched.slots = slice(first, first + len(watched.names))
             first += len(watched.names)
-        self._usage[:first] = [1.0] * first
+        names = [one.name for one in self.resources]
+        self._usage[:] = [before.get(name, 1.0) for name in names]
+        self._usage += [0.0] * (RESOURCE_SLOTS - len(names))
+        self._by_process = {
+            slot: amounts[name] for slot, name in enumerate(names) if name in amounts
+        }
+        for watched in former.values():
+            self._devices.pop(watched.name, None)
+            watched.lane.put(watched.close)
+            if watched.lane is not self._shared:
+                watched.lane.end()
+                self._left.append(watched.lane)
+        return tuple(watched.made for watched in former.values())
 
     @property
     def present(self) -> int:
@@ -314,14 +342,14 @@ class _Watched:
     """
 
     def __init__(
-        self, made: MadeProbe, first: int, clock: Callable[[], float], progress: threading.Event,
-    ) -> None:  # fmt: skip
+        self, made: MadeProbe, clock: Callable[[], float], progress: threading.Event
+    ) -> None:
+        self.made = made
         self.name = made.name
         self._title = titled("probe", made.name)
         self.names = tuple(resource.name for resource in made.resources)
         self.deadline = made.deadline
-        self.slots = slice(first, first + len(self.names))
-        self.mask = ((1 << len(self.names)) - 1) << first
+        self.slots = slice(0, 0)  # set by the sampler
         self.lane = _Lane(f"rosrm-probe-{made.name}")
         self.quick_reads = 0
         self.reason = ""
@@ -352,6 +380,11 @@ class _Watched:
         self.asked = now
         self.busy = True
         return self._read
+
+    @property
+    def mask(self) -> int:
+        """Return the bits of its slots."""
+        return (1 << self.slots.stop) - (1 << self.slots.start)
 
     def running(self, now: float) -> float:
         """Return the seconds since the running read began; 0 while it is queued."""

@@ -62,6 +62,10 @@ class UsageWatch:
         }
         self._publish_in = _READINGS_FIRST
 
+    def forget(self) -> None:
+        """Forget the usage that is not published yet, because slots have other resources now."""
+        self._seen = {}
+
     def _others(
         self, leader: int, by_process: Mapping[int, Mapping[int, float]]
     ) -> dict[int, float]:

@@ -16,6 +16,7 @@ from rosrm.core.supervisor.events import ContactReported
 from rosrm.errors import SupervisorError
 from rosrm.model.start_trace import stamped_in
 from rosrm.model.values import InstanceId, InstanceStatus
+from rosrm.runtime.state_lock import closed_in_forks
 from rosrm.supervisor import json_lines, messages, paths
 from rosrm.supervisor.client_values import (
     Amended,
@@ -97,6 +98,9 @@ class SupervisorClient:
 
     def __init__(self, peer: socket.socket, state_directory: Path) -> None:
         self._peer = peer
+        # A child that a plugin forks would hold the connection after the end of this process.
+        self._unforked = contextlib.ExitStack()
+        self._unforked.enter_context(closed_in_forks(peer.fileno()))
         self._outgoing = Outgoing(peer)
         self._state = state_directory
         self._lines = json_lines.LineSplitter()
@@ -200,6 +204,7 @@ class SupervisorClient:
 
     def close(self) -> None:
         """Close the connection; the instances keep running."""
+        self._unforked.close()
         self._outgoing.close()
 
     def __enter__(self) -> Self:

@@ -146,7 +146,7 @@ class ProbeContract:
         for resource in resources:
             fault = resource_fault(resource)
             assert not fault, f"the probe {fault}"
-        fault = unmeasured(probe, resources)
+        fault = unmeasured(resources, measures=hasattr(probe, "by_process"))
         assert not fault, f"the probe {fault}"
         assert len(set(names)) == len(names), f"two resources of one name: {names}"
         assert set(names) <= set(self.offer.resources), (

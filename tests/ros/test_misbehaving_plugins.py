@@ -12,7 +12,7 @@ import pytest
 
 from rosrm.config.settings import MigrationSettings
 from rosrm.errors import RosrmError
-from rosrm.model.values import MigrationPolicy, ProcessSpec
+from rosrm.model.values import HostLossPolicy, MigrationPolicy, ProcessSpec
 from tests.ros.clusters import Cluster, Make, alive, host, job, service
 from tests.waiting import PATIENCE, wait_until
 
@@ -114,9 +114,12 @@ PROBES = {
     "joins_ros": joins_ros, "leaves_threads": leaves_threads, "leaves_fork": leaves_fork,
     "takes_signals": takes_signals, "sets_environment": sets_environment,
 }
+def create_late(options, context):
+    while os.path.exists(__file__ + ".hold"): time.sleep(0.05)
+    return Probe("late", lambda: None)
 @hookimpl
 def register_probes():
-    return [
+    return [ProbeOffer("late", create_late)] + [
         ProbeOffer(name, lambda o, c, name=name, act=act: Probe(name, act))
         for name, act in PROBES.items()
     ]
@@ -282,6 +285,36 @@ def test_a_fork_of_a_plugin_holds_no_lock(make_cluster: Make) -> None:
     cluster.start_slave_again("h0")
     cluster.wait("innocent", "running")
     assert cluster.process("innocent").pid == pid
+
+
+def test_a_probe_that_hangs_at_a_restart_of_its_slave_ends_no_process(
+    make_cluster: Make, guest: Path
+) -> None:
+    """The slave starts without it, renews the fences meanwhile, and reads it once it is created."""
+    cluster = _with_probe(make_cluster, "late", limits={"memory": 0.9, "late": 0.9})
+    cluster.submit(service("kept", host_loss=HostLossPolicy("elsewhere")))
+    before = cluster.wait("kept", "running")
+    hold = guest / "guest_plugin.py.hold"
+    hold.touch()
+    try:
+        cluster.end(cluster.slaves["h0"], signal.SIGKILL)
+        cluster.start_slave_again("h0")
+        wait_until(
+            lambda: [one.name for one in cluster.host("h0").resources if one.stale] == ["late"],
+            "its resource is stale",
+        )
+        assert "probe 'late': not created within 4 s" in cluster.log_of("h0")
+    finally:
+        hold.unlink()
+    cluster.wait_for_event("host_changed", "h0 has other resources", host="h0")
+    wait_until(
+        lambda: not any(one.stale for one in cluster.host("h0").resources), "the probe is read"
+    )
+    assert ("probe", "late") not in failing(cluster)
+    after = cluster.wait("kept", "running")
+    assert (after.pid, after.restarts) == (before.pid, 0)
+    assert alive(before.pid)
+    assert not cluster.events("given_up")
 
 
 @pytest.mark.parametrize("name", ["exits", "crashes"])

@@ -324,7 +324,7 @@ class SlaveEndpoint:
         """Register again, with another description of the same run of this slave."""
         self.description = description
         if self.link is not MasterLink.SEARCHING:
-            self._lose_master("the settings of this host have changed; registering again")
+            self._lose_master("the description of this host has changed; registering again")
 
     def _lose_master(self, reason: str) -> None:
         self.link = MasterLink.SEARCHING

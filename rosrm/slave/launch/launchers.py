@@ -12,7 +12,7 @@ from itertools import islice
 from typing import Any, Final, TypeVar, cast
 
 from rosrm import clocks
-from rosrm.errors import LaunchError, PluginError, RosrmError
+from rosrm.errors import LaunchError, PluginError, RosrmError, SkipPlugin
 from rosrm.extensions.answers import MOST_VALUES, exact, whole
 from rosrm.extensions.contracts import (
     Capabilities,
@@ -23,7 +23,7 @@ from rosrm.extensions.contracts import (
 )
 from rosrm.extensions.declared_fields import unshared
 from rosrm.extensions.guard import guarded
-from rosrm.extensions.made import MadeLauncher, MadeLaunchers
+from rosrm.extensions.made import MadeLauncher
 from rosrm.extensions.plugin_calls import PluginCalls, given, implements, required, titled
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
 
@@ -55,6 +55,9 @@ class Launchers:
     Attributes:
         made: by name.
         unusable: name to the reason, of those that are absent or broken here.
+        awaited: names of those that are still being created. They may lead or have started any
+            instance, so a question about one has no answer.
+        broken: name to the reason, of those that could not be created.
         capabilities_of: names the launcher of a process; raises `PluginError` if that is unknown.
         calls: guard and record of the calls.
     """
@@ -63,21 +66,30 @@ class Launchers:
     unusable: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     capabilities_of: Callable[[ProcessSpec], Capabilities] = _no_capabilities
     calls: PluginCalls = field(default_factory=PluginCalls)
+    awaited: frozenset[str] = frozenset()
+    broken: dict[str, str] = field(init=False, default_factory=dict)
     _since: dict[str, float] = field(init=False, default_factory=dict)
     _locks: dict[str, threading.Lock] = field(init=False, default_factory=dict)
 
-    @classmethod
-    def of(
-        cls, offered: MadeLaunchers, capabilities_of: Callable[[ProcessSpec], Capabilities],
-        calls: PluginCalls,
-    ) -> Launchers:  # fmt: skip
-        """Return the launchers of this host; log which of them cannot be used, and why."""
-        absent = {name: f"absent: {reason}" for name, reason in offered.absent.items()}
-        broken = {name: f"broken: {reason}" for name, reason in offered.broken.items()}
-        unusable = {**absent, **broken}
-        for name, reason in unusable.items():
+    def add(self, name: str, make: Callable[[], MadeLauncher]) -> None:
+        """Add a launcher that was awaited, or log why it cannot be used.
+
+        Args:
+            make: returns the launcher, or raises `SkipPlugin` or `PluginError`.
+        """
+        try:
+            self.made = {**self.made, name: make()}
+        except SkipPlugin as skip:
+            reason = f"absent: {skip}"
+        except PluginError as fault:
+            self.broken[name] = str(fault)
+            reason = f"broken: {fault}"
+        else:
+            reason = ""
+        self.awaited -= {name}
+        if reason:
+            self.unusable = {**self.unusable, name: reason}
             _log.info("launcher %s is %s", name, reason)
-        return cls(offered.made, unusable, capabilities_of, calls)
 
     @property
     def variables(self) -> tuple[str, ...]:
@@ -94,6 +106,7 @@ class Launchers:
         own = self._launcher_of(launch)
         if own and own not in self.made:
             reason = self.unusable.get(own, "not installed")
+            reason = "not created yet" if own in self.awaited else reason
             raise LaunchError(f"{instance} needs the launcher {own!r}, which is {reason}")
         # The image of a process that moves by another strategy may be of any that makes images.
         others = [name for name in self.made if name != own] if restored else []
@@ -174,14 +187,15 @@ class Launchers:
             self._ask(name, "has_departed", launcher, None, bool, leader)
             for name, launcher in self._of(GraphDepartureLauncher)
         }
-        return True if True in answers else (None if None in answers else False)
+        unknown = self.awaited or None in answers
+        return True if True in answers else (None if unknown else False)
 
     def members(self, leader: int) -> Sequence[int] | None:
         """Return all processes of an instance that a launcher's program leads, the leader first.
 
         (): no launcher's program leads it. None: a launcher cannot tell, or may lead it soon.
         """
-        known = True
+        known = not self.awaited
         for name, launcher in self._of(ProcessTreeLauncher):
             leads = self._leads(name, launcher, leader)
             if leads:

@@ -10,7 +10,8 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import ReadSettings, Reply
 from rosrm.extensions.placement import PolicySettings, ScoringLink
 from rosrm.model.orders import ReloadSettings
-from tests.unit.core.cluster import Cluster, Eq1, Machine, process
+from rosrm.model.values import Container, ResourceDescription
+from tests.unit.core.cluster import GIB, Cluster, Eq1, Machine, process
 
 
 def ask(cluster: Cluster) -> int:
@@ -135,3 +136,49 @@ def test_a_slave_that_registers_again_with_the_same_description_changes_nothing(
     cluster = Cluster(Machine("a", labels={"arm": "no"}))
     cluster.register(cluster.machines["a"])
     assert cluster.recorded("host_changed") == []
+
+
+def test_a_slave_whose_probe_is_created_late_describes_its_resources_again() -> None:
+    """Until then the host gets no work; its processes stay, and are reserved for as before."""
+    machine = Machine("a", memory=16 * GIB)
+    cluster = Cluster(machine)
+    cluster.submit(process("p", needs={"memory": 4 * GIB}))
+    real, column = machine.resources, cluster.state.hosts.by_name["a"].column
+
+    def reserved() -> list[float]:
+        table = cluster.state.hosts
+        return [float(table.load[table.resources.index(one), column]) for one in ("memory", "cpu")]
+
+    before = reserved()
+    machine.resources = (real[1], ResourceDescription("memory", "1", 1.0, "unknown"))
+    machine.busy["memory"] = 1.0
+    machine.stale = {"memory"}
+    machine.connected = False
+    cluster.wait(3.0)
+    assert cluster.restart_slave("a").accepted
+    cluster.submit(process("q", needs={"memory": GIB}))
+    cluster.wait(5.0)
+    assert (cluster.where("p"), cluster.where("q")) == (["a"], [])
+
+    machine.resources, machine.stale = real, set()
+    machine.busy["memory"] = 0.1
+    cluster.register(machine)
+    cluster.wait(3.0)
+    assert (cluster.where("p"), cluster.where("q")) == (["a"], ["a"])
+    assert cluster.recorded("host_changed") == ["a has other resources: memory, cpu"]
+    cluster.cancel("q")
+    cluster.wait(3.0)
+    assert reserved() == before
+
+
+def test_a_slave_whose_launcher_is_created_late_gets_the_work_that_needs_it() -> None:
+    """The process waited, because no host had its launcher."""
+    cluster = Cluster(Machine("a"))
+    description = replace(cluster.state.hosts.by_name["a"].description, launchers=("podman",))
+    cluster.submit(process("p", container=Container("image", "podman")))
+    assert cluster.where("p") == []
+    cluster.request(happened.HostRegistered(0, description, (), ()))
+    cluster.ask_for_work(cluster.machines["a"])
+    cluster.wait(3.0)
+    assert cluster.where("p") == ["a"]
+    assert cluster.recorded("host_changed") == ["a has other launchers: podman"]

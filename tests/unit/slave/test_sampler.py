@@ -330,6 +330,26 @@ def test_a_probe_that_could_not_be_made_is_full_and_stale(rig):
     ]
 
 
+def test_a_probe_takes_the_place_of_its_substitute_and_the_others_keep_their_readings():
+    """Its resources may be others than declared, so that the slots of the others change."""
+    cpu, clock = made_probe("cpu", FakeProbe(cpu=0.25)), FakeClock()
+    declared = [ResourceDescription(name, "1", 1.0) for name in ("lidar", "heat")]
+    stand_in = made_probe("lidar", FailedProbe(declared, "not created yet"))
+    sampler = Sampler([stand_in, cpu], clock=clock)
+    sampler.first(PATIENCE)
+    assert sampler.latest(clock.advance(TICK)).usage[:3].tolist() == [1.0, 1.0, 0.25]
+    made = made_probe("lidar", FakeProbe(lidar=0.5))
+    assert sampler.rearrange([made, cpu]) == (stand_in,)
+    assert [one.name for one in sampler.resources] == ["lidar", "cpu"]
+    sample = sampler.latest(clock.advance(TICK))
+    assert (sample.usage[:3].tolist(), sample.stale) == ([1.0, 0.25, 0.0], 1), "full and stale"
+    assert sampler.settle(PATIENCE)
+    sample = sampler.latest(clock.advance(TICK))
+    assert (sample.usage[:3].tolist(), sample.stale) == ([0.5, 0.25, 0.0], 0)
+    assert sampler.settle(PATIENCE)
+    assert sampler.close() == ()
+
+
 def test_probe_is_read_once_a_period():
     """A probe of a longer period is not read in every cycle, and jitter skips none."""
     quick, seldom = FakeProbe(quick=0.1), FakeProbe(seldom=0.1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
@@ -34,6 +34,11 @@ from rosrm.wording import counted, listed
 
 #: Seconds after its `leave` for which readings that a slave sent before may arrive.
 _STILL_THERE: Final = 3.0
+#: Fields that a slave may describe in another way, in messages.
+_CHANGES: Final = {
+    "labels": "labels", "resources": "resources", "absent": "absent probes",
+    "launchers": "launchers",
+}  # fmt: skip
 #: Most different resources of all hosts: each is a row of the table, which never gets smaller.
 _MOST_RESOURCES: Final = 64
 
@@ -146,19 +151,39 @@ def _registered_again(
     state.hosts.last_contact[host.column] = now
     note_devices(state, host, event.description.devices, now)
     replication.note_states(state, host, event.snapshots, now)
-    if state.hosts.redescribe(host, event.description):
-        save_host(state, host)
-        labels = dict(host.description.labels)
-        shown = ", ".join(f"{key}={value}" for key, value in labels.items()) or "none"
-        message = f"{host.name} has other labels: {shown}"
-        state.record(now, EventKind.HOST_CHANGED, message, host=host.name, facts={"labels": labels})
-        reconsider_set_aside(state, now)
+    changed = state.hosts.redescribe(host, event.description)
+    if changed:
+        _take_changes(state, host, changed, now)
     condition = state.hosts.condition_of(host)
     if condition in (HostCondition.LOST, HostCondition.SUSPECT):
         mark_up(state, host, now)
     if condition is not HostCondition.LOST:
         state.ask_for_report(host, now)
     state.emit(Reply(event.request, host_id=host.host_id))
+
+
+def _take_changes(state: MasterState, host: Host, changed: Sequence[str], now: float) -> None:
+    """Record what a slave describes in another way, and consider the queue again."""
+    described = host.description
+    if "labels" in changed:
+        save_host(state, host)
+    if "resources" in changed:  # the reservations are fractions of the former capacities
+        for instance in state.instances_of(host):
+            settle_reservation(state, instance, now)
+    labels, resources = dict(described.labels), {r.name: r.capacity for r in described.resources}
+    shown = {
+        "labels": ", ".join(f"{key}={value}" for key, value in labels.items()),
+        "resources": ", ".join(resources),
+        "absent": ", ".join(described.absent),
+        "launchers": ", ".join(described.launchers),
+    }
+    changes = "; ".join(f"{_CHANGES[name]}: {shown[name] or 'none'}" for name in changed)
+    facts = {"labels": labels, "resources": resources, "absent": dict(described.absent)}
+    state.record(
+        now, EventKind.HOST_CHANGED, f"{host.name} has other {changes}", host=host.name,
+        facts=facts,
+    )  # fmt: skip
+    reconsider_set_aside(state, now)
 
 
 def _clear_exclusions(state: MasterState, host: Host) -> None:

@@ -39,7 +39,7 @@ MOST_AHEAD: Final = 1000
 #: Shortest period, in seconds, that counts between two readings of a host.
 _SHORTEST_PERIOD: Final = 0.01
 #: Fields of a description that may change while the slave runs.
-CHANGEABLE: Final = ("labels",)
+CHANGEABLE: Final = ("labels", "resources", "absent", "launchers")
 
 
 class HostCondition(IntEnum):
@@ -193,23 +193,10 @@ class HostTable(HostColumns):
         host = self.by_name.get(description.name) or self.expect(description.name)
         column = host.column
         host.description, host.has_labels, host.pruned = description, True, False
-        host.attributed = description.accounted("attributed")
-        host.shared = description.accounted("shared")
         self._listed = None
-        for known in (host.exceeded_since, host.over_since, host.over_at):
-            known.clear()
-        for resource in description.resources:
-            if resource.name not in self.resources:
-                self.add_resource(resource.name)
-        rows = [self.resources.index(resource.name) for resource in description.resources]
-        self.clear_column(column)
-        self.row_of_slot[column, : len(rows)] = rows
-        self.capacity[rows, column] = [resource.capacity for resource in description.resources]
-        self.usage[rows, column] = 0.0
-        self.busy[rows, column] = self.load[rows, column]
+        self._set_resources(host)
         self.condition[column] = HostCondition.UP
-        self.asking[column] = self.accepting[column] = self.report_due[column] = False
-        self.stale[column] = 0
+        self.asking[column] = self.report_due[column] = False
         self.last_contact[column] = self.registered[column] = self.newest_registration = now
         self.bound[column] = description.max_processes or NO_BOUND
         self.period[column], self.read_at[column] = description.period, now
@@ -223,6 +210,25 @@ class HostTable(HostColumns):
         self.set_devices(host, description.devices)
         return host
 
+    def _set_resources(self, host: Host) -> None:
+        """Take over the resources of a host, without readings yet."""
+        column, described = host.column, host.description.resources
+        host.attributed = host.description.accounted("attributed")
+        host.shared = host.description.accounted("shared")
+        for known in (host.exceeded_since, host.over_since, host.over_at):
+            known.clear()
+        for resource in described:
+            if resource.name not in self.resources:
+                self.add_resource(resource.name)
+        rows = [self.resources.index(resource.name) for resource in described]
+        self.clear_column(column)
+        self.row_of_slot[column, : len(rows)] = rows
+        self.capacity[rows, column] = [resource.capacity for resource in described]
+        self.usage[rows, column] = 0.0
+        self.busy[rows, column] = self.load[rows, column]
+        self.accepting[column] = False
+        self.stale[column] = 0
+
     def redescribe(self, host: Host, description: HostDescription) -> tuple[str, ...]:
         """Take over what a slave may change while it runs; return the names of what has changed."""
         new = {name: getattr(description, name) for name in CHANGEABLE}
@@ -231,7 +237,10 @@ class HostTable(HostColumns):
         )
         if changed:
             host.description = replace(host.description, **new)
+            if "resources" in changed:
+                self._set_resources(host)
             self._labelled.clear()
+            self._launching.clear()
             self.changed()
         return changed
 
