@@ -213,10 +213,21 @@ class Registry:
         """Create a scoring policy; raises `ConfigError` or `PluginError`."""
         return cast(ScoringPolicy, self._required("scoring", name, options))
 
-    def link(self, name: str, options: Mapping[str, Any], weight: float = 1.0) -> ScoringLink:
-        """Create a scoring policy as a link of a chain; raises as `scoring` does."""
+    def link(
+        self, name: str, options: Mapping[str, Any], weight: float = 1.0,
+        *, seconds: float | None = None,
+    ) -> ScoringLink:  # fmt: skip
+        """Create a scoring policy as a link of a chain; raises as `scoring` does.
+
+        Args:
+            name: of the offer.
+            options: of the policy.
+            weight: factor of its scores.
+            seconds: time-out of each call of the plugin; None: `LOADING_LIMIT`.
+        """
         offer = cast(ScoringOffer, self.offer("scoring", name))
-        return ScoringLink(name, self.scoring(name, options), weight, tuple(offer.reads))
+        made = self._required("scoring", name, options, seconds=seconds)
+        return ScoringLink(name, cast(ScoringPolicy, made), weight, tuple(offer.reads))
 
     def filters(self, chosen: NameToOptions) -> tuple[SelectedFilter, ...]:
         """Create placement filters, in this order; raises as `scoring` does."""
@@ -528,33 +539,41 @@ class Registry:
                 kind, name, str(fault) if own else f"its `{hook}` raised {fault}"
             ) from fault
 
-    def _required(self, kind: PluginKind, name: str, options: Mapping[str, Any]) -> Any:
+    def _required(
+        self, kind: PluginKind, name: str, options: Mapping[str, Any], *,
+        seconds: float | None = None,
+    ) -> Any:  # fmt: skip
         """Create an object that the master needs, so that its absence here is an error."""
         try:
-            return self._make(kind, name, options)
+            return self._make(kind, name, options, seconds=seconds)
         except SkipPlugin as skip:
             self._outcome[kind, name] = ("absent", str(skip))
             raise ConfigError(f"{TITLES[kind]} {name!r} is absent here: {skip}") from skip
 
-    def _make(self, kind: PluginKind, name: str, options: Mapping[str, Any], *more: Any) -> Any:
-        offer = self.offer(kind, name)
+    def _make(
+        self, kind: PluginKind, name: str, options: Mapping[str, Any], *more: Any,
+        seconds: float | None = None,
+    ) -> Any:  # fmt: skip
+        offer, limit = self.offer(kind, name), _limit(seconds)
         try:
             settings = guarded(
                 partial(from_plain, offer.options, options), whom=titled(kind, name),
-                hook="options", lets=(ValueError,),
+                hook="options", seconds=limit, lets=(ValueError,),
             )  # fmt: skip
         except ValueError as wrong:
             raise ConfigError(f"options of {TITLES[kind]} {name!r}: {wrong}") from wrong
         except PluginError as fault:
             raise self._fault(kind, name, f"its options cannot be read: {fault}") from fault
-        return self._create(kind, name, offer, settings, *more)
+        return self._create(kind, name, offer, settings, *more, seconds=limit)
 
-    def _create(self, kind: PluginKind, name: str, offer: Offer, *given: Any) -> Any:
-        create = cast(Callable[..., Any], offer.create)
+    def _create(
+        self, kind: PluginKind, name: str, offer: Offer, *given: Any, seconds: float | None = None
+    ) -> Any:
+        create, limit = cast(Callable[..., Any], offer.create), _limit(seconds)
 
         def late() -> str:
             return (
-                f"it did not return within {guard.LOADING_LIMIT:g} s; correct what blocks it, or "
+                f"it did not return within {limit:g} s; correct what blocks it, or "
                 f"leave {name!r} out of the configuration"
             )
 
@@ -564,7 +583,7 @@ class Registry:
 
         try:
             thing, lacks = guarded(
-                made, whom=titled(kind, name), hook="create", seconds=guard.LOADING_LIMIT,
+                made, whom=titled(kind, name), hook="create", seconds=limit,
                 late=late, lets=(SkipPlugin, ConfigError),  # not a fault of the plugin
             )  # fmt: skip
         except PluginError as fault:
@@ -653,6 +672,10 @@ class Registry:
             return note
         many = counted(others, "plugin is", "plugins are")
         return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
+
+
+def _limit(seconds: float | None) -> float:
+    return guard.LOADING_LIMIT if seconds is None else seconds
 
 
 def _fault_beside(listed: ProbeList, drafted: DraftedProbe) -> str:

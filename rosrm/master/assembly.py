@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 
-from rosrm.config.placement import chain_of, placement_of
+from rosrm.config.placement import placement_of
 from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
 from rosrm.extensions.guard import Crash
 from rosrm.extensions.registry import MASTER_KINDS, Registry
+from rosrm.master.chain_creation import CREATION_LIMIT, ChainCreation
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
 from rosrm.master.settings_reload import SettingsReload
@@ -34,7 +34,8 @@ def new_runtime(
     rows = registry.rows(*MASTER_KINDS)
     placement = replace(placement, fallback=fallback_of(registry, config))
     declared = registry.declared(config.migration.strategies)
-    reload = SettingsReload(config, handover.source, partial(chain_of, registry))
+    chains = ChainCreation(registry, min(CREATION_LIMIT, config.liveness.lease / 4.0))
+    reload = SettingsReload(config, handover.source, chains)
     return MasterRuntime(
         config, participant, placement, strategies, rows, checkpoint,
         declared=declared, reload=reload,

@@ -214,7 +214,7 @@ class MasterRuntime:
             self._config.core(), placement, strategies, epoch, declared=self._declared
         )
         state.plugins.limit = self._deadlines
-        state.chain_of = self._reload.chain_of
+        state.chain_of = self._reload.chains
         state.scoring = state.scoring_in_force = settings_of_chain(self._config)
         state.wall, state.boot = clocks.wall_time(), _boot()
         state.replication.policy = self._checkpoint
@@ -335,6 +335,7 @@ class MasterRuntime:
                     self._participant.guard.call(self._from_threads.popleft())
                 now = self._now()
                 self._deadlines.begin_turn()
+                self._reload.chains.begin_turn()
                 self._leave_out_suspend()
                 if now >= next_tick:
                     next_tick = now + _TICK

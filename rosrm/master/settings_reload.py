@@ -9,7 +9,7 @@ from rosrm.config.reloading import OF_CLUSTER, reloaded
 from rosrm.config.settings import ClusterConfig
 from rosrm.core.master.events import SettingsRead
 from rosrm.errors import RosrmError
-from rosrm.extensions.placement import ChainOf
+from rosrm.master.chain_creation import ChainCreation
 from rosrm.runtime.settings_check import SettingsCheck, SettingsSource
 
 
@@ -19,14 +19,17 @@ class SettingsReload:
     Args:
         config: the settings at the start.
         source: their origin.
-        chain_of: creates the scoring policies with other weights and options.
+        chains: creates the scoring policies with other weights and options.
 
     Attributes:
+        chains: as the argument.
         hang_up: handler of SIGHUP.
     """
 
-    def __init__(self, config: ClusterConfig, source: SettingsSource, chain_of: ChainOf) -> None:
-        self.chain_of = chain_of
+    def __init__(
+        self, config: ClusterConfig, source: SettingsSource, chains: ChainCreation
+    ) -> None:
+        self.chains = chains
         self._config = config
         self._check = SettingsCheck(source, ClusterConfig.from_json, partial(self._take, 0))
         self.hang_up = self._check.hang_up
@@ -57,7 +60,7 @@ class SettingsReload:
         read = reloaded(self._config, new, allowed)
         chain = settings_of_chain(read.config)
         try:
-            self.chain_of(chain)
+            self.chains(chain)
         except RosrmError as error:
             return SettingsRead(request, f"scoring: {error}")
         self._config = read.config

@@ -15,6 +15,8 @@ import pytest
 
 from rosrm.config.settings import ClusterConfig, HostConfig
 from rosrm.core.master.events import SettingsRead
+from rosrm.extensions.registry import Registry
+from rosrm.master.chain_creation import ChainCreation
 from rosrm.master.settings_reload import SettingsReload
 from rosrm.runtime.settings_check import SettingsCheck, SettingsSource
 from tests.waiting import wait_until
@@ -97,7 +99,8 @@ def test_settings_of_another_version_are_a_fault_of_the_reload(tmp_path: Path, i
     assert fault.endswith("If rosrm was upgraded since its start, restart it")
 
     path.write_text("name: n\n")
-    reload = SettingsReload(ClusterConfig(), SettingsSource("master", str(path)), lambda _: None)
+    chains = ChainCreation(Registry.of(), 1.0)
+    reload = SettingsReload(ClusterConfig(), SettingsSource("master", str(path)), chains)
     reload.start(7)
     read: list[SettingsRead] = []
     wait_until(lambda: read.extend(reload.poll()) or read, "the file was read")
