@@ -22,6 +22,8 @@ _TICKS_PER_SECOND: Final = os.sysconf("SC_CLK_TCK")
 #: Marks in a process's environment: its instance, and the state directory of its supervisor.
 INSTANCE_MARK = "ROSRM_INSTANCE"
 SUPERVISOR_MARK = "ROSRM_SUPERVISOR"
+#: Variable with the directory of the node's snapshots.
+KEEP: Final = "ROSRM_KEEP"
 
 #: Flag of the kernel's own threads (PF_KTHREAD).
 _KERNEL_THREAD: Final = 0x200000

@@ -10,7 +10,9 @@ and its restart policy decides.
 
 A loss of power takes the newest lines of the record. So what the record of an earlier boot says
 about an instance that had not ended is uncertain: one that is held or starting there may have run,
-and may have finished. It has an unknown end, too, and only a policy to restart starts it.
+and may have finished. It has an unknown end, too, and only a policy to restart starts it. If its
+node has snapshots, those of this host may be older than a replica on another one. So such an
+instance is withdrawn instead of restarted: the master queues it again, with the newest snapshot.
 """
 
 from __future__ import annotations
@@ -28,22 +30,26 @@ from rosrm.core.supervisor.events import (
     SessionEnded,
     Spawned,
     SpawnFailed,
+    StopOrdered,
 )
 from rosrm.core.supervisor.instance import (
+    BACKOFF,
     HELD,
     RUNNING,
     STARTING,
     STOPPING,
+    THEN_END,
     THEN_POLICY,
     THEN_RESTART,
     UNKNOWN_EXIT,
     Instance,
 )
 from rosrm.core.supervisor.reducer import SupervisorState
+from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import instance_record, lease_file, procfs
 from rosrm.supervisor.instance_record import Recorded
 from rosrm.supervisor.process_tree import ProcessTrees, mark
-from rosrm.supervisor.procfs import Stat
+from rosrm.supervisor.procfs import KEEP, Stat
 
 _RESTARTED: Final = "its machine was restarted"
 
@@ -57,7 +63,7 @@ def restore(state: str, core: SupervisorState, trees: ProcessTrees) -> Recorded:
     for instance in recorded.instances.values():
         if not recorded.same_boot:
             _restart_clock(instance, clocks.boot_time())
-            _doubt(instance)
+            _doubt(instance, has_snapshots=_has_snapshots(recorded, instance.key))
         alive = instance.fence is not None and instance.fence.alive
         instance.heard = max(instance.heard, newest.at, newest.alive if alive else -inf)
         core.restore(instance)
@@ -80,13 +86,23 @@ def _restart_clock(instance: Instance, now: float) -> None:
         instance.kill_by = now
 
 
-def _doubt(instance: Instance) -> None:
+def _has_snapshots(recorded: Recorded, key: Key) -> bool:
+    launch = recorded.launches.get(key)
+    if launch is None:
+        return False
+    base = recorded.environments.get(launch.environment, {})
+    return bool(launch.changes.get(KEEP, base.get(KEEP)))
+
+
+def _doubt(instance: Instance, *, has_snapshots: bool) -> None:
     """Let an instance recorded in an earlier boot be one that may have run to its end."""
     if instance.pid:
         instance.fault = _RESTARTED
     if instance.phase in (HELD, STARTING):
         instance.phase = STARTING  # never held: a free slot would start it
         instance.exit_code = UNKNOWN_EXIT
+    if has_snapshots and not instance.ended and instance.then != THEN_END:
+        instance.withdrawn = True
     if instance.then == THEN_RESTART:  # the ordered run may have begun
         instance.then = THEN_POLICY
 
@@ -111,6 +127,8 @@ def what_happened(
             yield SpawnFailed(instance.key, unknown, transient=True)
         elif instance.phase == STARTING:
             yield _start_of(instance, left, recorded, trees)
+        elif instance.phase == BACKOFF and instance.withdrawn:
+            yield StopOrdered(instance.key)
         elif instance.phase in (RUNNING, STOPPING):
             yield from _end_of(instance, left, trees)
 

@@ -62,7 +62,8 @@ class Instance:
             or the time of the start.
         fenced: text on why it was fenced; "": not fenced, or already being stopped for good.
         kill_by: latest time of SIGKILL after it was fenced; None: not fenced.
-        withdrawn: the shutdown of the supervisor stops it, not an order of the client.
+        withdrawn: the shutdown of the supervisor stops it, not an order of the client; or the
+            master decides on its restart, because the machine was restarted.
         slots: it starts once fewer than this number of others are active; 0: it is never held.
         adopted: its last run was started without rosrm, so its exit code is never known.
     """

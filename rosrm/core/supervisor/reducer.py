@@ -55,7 +55,8 @@ policy and of later orders.
 
 `ShutdownOrdered` stops every instance as `StopOrdered` does. An instance that no order had stopped
 before ends as withdrawn, not exited. So the master can distinguish this end from an end by its own
-order or by the process.
+order or by the process. After a restart of the machine an instance with snapshots is withdrawn
+instead of restarted by its policy (`rosrm.supervisor.takeover`).
 
 `SlotFreed` occurs when fewer than `slots` instances other than a held one are active, that is,
 neither held nor ended. The supervisor needs no client for this start, because it already has the

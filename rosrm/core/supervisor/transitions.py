@@ -377,6 +377,9 @@ def _by_policy(instance: Instance, ending: str, *, succeeded: bool, now: float) 
     if instance.fenced:
         end(instance, FENCED, f"{instance.fenced}; {ending}")
         return
+    if instance.withdrawn:
+        end(instance, WITHDRAWN, ending)
+        return
     done = _recent_restarts(instance, now)
     if done >= rule.attempts:
         most = counted(rule.attempts, "restart")

@@ -17,13 +17,13 @@ from rosrm.model.values import Assignment, InstanceId, qualified_name
 from rosrm.ros.fast_dds import announcements
 from rosrm.ros.names import token
 from rosrm.runtime.ros_wheels import without_bootstrapper
+from rosrm.supervisor.procfs import KEEP
 
 #: Variable that is set if an instance starts as the destination of a handoff.
 SHADOW: Final = "ROSRM_SHADOW"
 #: Variable with the file in which the slave notes the newest epoch of the master.
 EPOCH_FILE: Final = "ROSRM_EPOCH_FILE"
-#: Variables with the directory of the node's snapshots, and the seconds by which they may lag.
-KEEP: Final = "ROSRM_KEEP"
+#: Variable with the seconds by which the node's snapshots may lag.
 KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
 #: Variable with the key of an instance, in base64, for a process in a container; and that with the
 #: file that has the key, for all other processes.

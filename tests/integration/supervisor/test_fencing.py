@@ -13,10 +13,11 @@ import pytest
 
 import rosrm
 from rosrm import clocks
-from rosrm.core.supervisor.events import ContactReported, RestartOrdered
+from rosrm.core.supervisor.events import ContactReported, RestartOrdered, StopOrdered
 from rosrm.model.values import Fence, InstanceId, InstanceState, RestartPolicy, StopPolicy
 from rosrm.supervisor.client_values import key_of
 from rosrm.supervisor.messages import Remember
+from rosrm.supervisor.procfs import KEEP
 from tests.waiting import PATIENCE, holds_for, wait_gone, wait_until
 
 from .conftest import kill
@@ -239,6 +240,41 @@ def test_after_a_restart_of_the_machine_no_job_is_restarted_by_a_former_order(ho
     client = host.connect()
     job = host.ended_after_connect(client, "job")
     assert (job.state, job.message) == (InstanceState.FAILED, "its machine was restarted")
+
+
+def test_after_a_restart_of_the_machine_a_node_with_snapshots_is_left_to_the_master(host, client):
+    """Its own snapshots may be half a minute old, and a replica on another host is newer."""
+    keeps = {**os.environ, KEEP: "/snapshots/of/it"}
+    slow = RestartPolicy("on-failure", delay=1000.0, max_delay=1000.0)
+    client.start([host.order("first", "sleep", "1000", environment=keeps, restart=ALWAYS)])
+    pids = [host.running(client, "first").pid, host.sleeper(client, "plain", restart=ALWAYS)]
+    client.start([host.order("waits", "false", environment=keeps, restart=slow)])
+    host.wait(client, "waits", InstanceState.BACKOFF)
+    pids.append(host.sleeper(client, "job", environment=keeps))
+    client.start([host.order("next", "true", environment=keeps, restart=ALWAYS, slots=1)])
+    host.wait(client, "next", InstanceState.HELD)
+    lose_power(host, client, *pids)
+    client = host.connect()
+    found = {status.instance.process: status for status in client.instances}
+    for name in ("first", "waits", "next"):
+        assert found[name].state is InstanceState.WITHDRAWN, found[name]
+    assert "its machine was restarted" in found["first"].message
+    assert found["job"].state is InstanceState.FAILED
+    wait_until(lambda: len(host.alive()) == 1, "the one without snapshots")
+
+
+def test_after_a_restart_of_the_machine_what_a_user_had_stopped_is_not_for_the_master(host, client):
+    """The master would queue it again."""
+    keeps = {**os.environ, KEEP: "/snapshots/of/it"}
+    client.start([host.order("one", *DEAF, environment=keeps, restart=ALWAYS,
+                             stop=StopPolicy(1000.0, 1000.0))])  # fmt: skip
+    host.running(client, "one")
+    wait_until(host.log("one").read_text, "its handlers")
+    client.send(StopOrdered(("one", 1)))
+    host.wait(client, "one", InstanceState.STOPPING)
+    lose_power(host, client, *host.alive())
+    client = host.connect()
+    assert host.ended_after_connect(client, "one").state is InstanceState.EXITED
 
 
 def of_another_boot(line: dict) -> None:
