@@ -759,6 +759,29 @@ def test_a_newer_epoch_fences_an_older_one(stage, pair):
     assert R.SILENT not in pair.conductor.of(1)
 
 
+def test_an_older_epoch_is_followed_where_the_slave_is_registered_with_it(stage, tmp_path, counter):
+    """An older copy of the journal was put back, so its master counts from there.
+
+    Otherwise the node would refuse its only master until its own restart.
+    """
+    epoch = tmp_path / "epoch"
+    epoch.write_text(f"{EPOCH - 2:020d}\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROSRM_EPOCH_FILE", str(epoch))
+        pair = pair_of(stage, counter)
+    counts = stage.listen(Int64, "count")
+    for other in (EPOCH - 3, EPOCH - 1):
+        pair.conductor.say(C.SHADOW, epoch=other)
+    goes_on(stage, counts, 20)
+    assert pair.conductor.reports == []
+    pair.conductor.say(C.SHADOW, epoch=EPOCH - 2)
+    pair.conductor.wait(2, R.READY)
+    for other in (EPOCH - 3, EPOCH - 1, EPOCH):  # the last ones are of the lost runs
+        pair.conductor.say(C.SWITCH, epoch=other)
+    goes_on(stage, counts, 20)
+    assert R.SILENT not in pair.conductor.of(1)
+
+
 def test_an_epoch_that_the_slave_does_not_know_leaves_the_node_open_to_its_master(
     stage, tmp_path, counter
 ):

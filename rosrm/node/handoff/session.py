@@ -169,7 +169,8 @@ class HandoffSession:
         if config.cluster != self.identity.cluster:
             theirs = config.cluster[:_LONGEST_NAME]
             return f"it is of {theirs!r}, and {self.identity.cluster!r} started this node"
-        if config.epoch < self._epoch:
+        # A master with an older copy of its journal counts from there, and the slave knows it.
+        if config.epoch < self._epoch and config.epoch != self.identity.registered_epoch():
             return f"it is of epoch {config.epoch}, and this is epoch {self._epoch}"
         if not config.channel:
             return "it names no channel"

@@ -275,7 +275,8 @@ std::string HandoffSession::fault_of(const StateConfig & config) const
     return "it is of '" + config.cluster.substr(0, kLongestName) + "', and '" +
            identity.cluster + "' started this node";
   }
-  if (config.epoch < epoch_) {
+  // A master with an older copy of its journal counts from there, and the slave knows it.
+  if (config.epoch < epoch_ && identity.registered_epoch() != config.epoch) {
     return "it is of epoch " + std::to_string(config.epoch) + ", and this is epoch " +
            std::to_string(epoch_);
   }
