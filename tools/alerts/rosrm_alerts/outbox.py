@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from rosrm import EventRow
 from rosrm.errors import RosrmError
 from rosrm.model.notices import Notice
 from rosrm.runtime.private_files import make_safe_directory, open_private
@@ -25,6 +26,9 @@ from rosrm_alerts.watch import Key, Subject
 #: Most notices that wait for one sink; beyond that the oldest are dropped.
 MOST: Final = 10_000
 
+#: Fields of an event that are stored.
+_KEPT: Final = ("sequence", "wall_time", "elapsed", "kind", "process", "host", "message")
+
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS notices (
   number INTEGER PRIMARY KEY AUTOINCREMENT, sink TEXT NOT NULL, notice TEXT NOT NULL);
@@ -32,6 +36,7 @@ CREATE INDEX IF NOT EXISTS by_sink ON notices (sink, number);
 CREATE TABLE IF NOT EXISTS active (
   alert TEXT NOT NULL, host TEXT NOT NULL, process TEXT NOT NULL, began REAL NOT NULL);
 CREATE TABLE IF NOT EXISTS position (sequence INTEGER NOT NULL);
+CREATE TABLE IF NOT EXISTS last_event (sequence INTEGER NOT NULL, event TEXT NOT NULL);
 """
 
 
@@ -73,6 +78,16 @@ class Outbox:
             row = self._file.execute("SELECT sequence FROM position").fetchone()
         return None if row is None else int(row[0])
 
+    def last_event(self) -> EventRow | None:
+        """Return the event at `position`, without its facts; None: not known.
+
+        After a journal gap the master gives its sequence to another event.
+        """
+        text = "SELECT event FROM last_event JOIN position USING (sequence)"
+        with self._lock:
+            row = self._file.execute(text).fetchone()
+        return None if row is None else EventRow(**json.loads(row[0]))
+
     def active(self) -> dict[Key, float]:
         """Return the alerts that were active at the last commit."""
         with self._lock:
@@ -81,7 +96,7 @@ class Outbox:
 
     def commit(
         self, notices: Sequence[tuple[str, Notice]], position: int | None,
-        active: Mapping[Key, float],
+        active: Mapping[Key, float], last_event: EventRow | None = None,
     ) -> int:  # fmt: skip
         """Store notices, each with the name of its sink; return the number of dropped ones."""
         rows = [(sink, json.dumps(notice.form())) for sink, notice in notices]
@@ -92,6 +107,11 @@ class Outbox:
                 self._file.execute("DELETE FROM position")
                 if position is not None:
                     self._file.execute("INSERT INTO position VALUES (?)", (position,))
+                self._file.execute("DELETE FROM last_event")
+                if last_event is not None:
+                    fields = {name: getattr(last_event, name) for name in _KEPT}
+                    row = (position, json.dumps(fields))
+                    self._file.execute("INSERT INTO last_event VALUES (?, ?)", row)
                 self._file.execute("DELETE FROM active")
                 self._file.executemany(
                     "INSERT INTO active VALUES (?, ?, ?, ?)",

@@ -69,7 +69,7 @@ class AlertService:
         self._file, self._outbox, self._connect = file, outbox, connect
         self._watch = Watch(file.alerts, outbox.active())
         position = outbox.position()
-        self._feed = EventFeed(self._list, position or 0, _MOST_EVENTS)
+        self._feed = EventFeed(self._list, position or 0, _MOST_EVENTS, outbox.last_event())
         self._is_first = position is None
         self._client: Client | None = None
         self._answers = True
@@ -113,7 +113,9 @@ class AlertService:
     def _store(self) -> None:
         """Store the notices; where the disk takes none, they wait here for the next look."""
         try:
-            dropped = self._outbox.commit(self._unstored, self._feed.after, self._watch.active)
+            dropped = self._outbox.commit(
+                self._unstored, self._feed.after, self._watch.active, self._feed.last
+            )
         except OutboxError as error:
             if str(error) != self._trouble:
                 _log.error("%s; the next attempt is in %g s", error, PERIOD)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
 import pytest
 
-from rosrm import NoMaster, Refused
+from rosrm import EventRow, Listing, NoMaster, Refused
 from rosrm_alerts.conditions import Alert, NoAnswer
+from rosrm_alerts.outbox import Outbox as OutboxFile
 from rosrm_alerts.outbox import OutboxError
 from rosrm_alerts.service import AlertService
 
@@ -19,6 +21,9 @@ class Outbox:
         return {}
 
     def position(self):
+        return None
+
+    def last_event(self):
         return None
 
     def commit(self, *_):
@@ -107,3 +112,47 @@ def test_a_full_disk_of_the_outbox_does_not_end_the_watch(monkeypatch, caplog) -
     assert [(sink, notice.alert) for sink, notice in stored] == [("hook", "silent")]
     assert told == [1]
     assert caplog.text.count("database or disk is full") == 1
+
+
+def event(sequence: int, run: int) -> EventRow:
+    return EventRow(sequence, 1000.0 * run + sequence, 0.0, "host_up", "", "", f"run {run}")
+
+
+class Record:
+    """A master's record of events."""
+
+    def __init__(self, *events: EventRow) -> None:
+        self.events = events
+
+    def list(self, after=0, newest=0, **_):
+        events = [one for one in self.events if one.sequence > after][-newest:]
+        return Listing("m", 1.0, self.events[-1].sequence, events=events)
+
+    def close(self):
+        pass
+
+
+@pytest.mark.parametrize("is_restarted", [False, True])
+@pytest.mark.parametrize("kept", [90, 93, 0], ids=["gap", "no gap", "another journal"])
+def test_events_of_a_run_after_a_journal_gap_are_seen_once(tmp_path, kept, is_restarted) -> None:
+    """Their sequences are those of lost events that the service has seen."""
+    before = [event(number, 1) for number in range(80, 94)]
+    record = Record(*before)
+    file = SimpleNamespace(alerts=(), forwarded=())
+    with ExitStack() as closing_all:
+
+        def begun() -> AlertService:
+            outbox = closing_all.enter_context(closing(OutboxFile(tmp_path / "o" / "outbox")))
+            return AlertService(file, {}, outbox, lambda: record)
+
+        service = begun()
+        service._look()
+        record.events = (*before, event(94, 1))
+        service._look()
+        if is_restarted:
+            closing_all.close()
+            service = begun()
+        new = [event(kept + number, 2) for number in range(1, 9)]
+        record.events = (*[one for one in before if one.sequence <= kept], *new)
+        assert service._ask() == tuple(new)
+        assert service._ask() == ()
