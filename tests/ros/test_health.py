@@ -325,6 +325,23 @@ def test_a_name_that_is_none_harms_nobody(stage) -> None:
     ear.close()
 
 
+def test_a_client_that_cannot_be_created_is_no_silence_of_the_node(stage, monkeypatch) -> None:
+    """For want of memory or descriptors; the slave would end the node as unhealthy."""
+    watch = Watch(Health("", 0.0, "active", SOON), (), ("/lidar/get_state",))
+
+    def refuse(*_: object, **__: object) -> None:
+        raise RuntimeError("failed to create client: out of memory")
+
+    with monkeypatch.context() as shortage:
+        shortage.setattr(stage.plain, "create_client", refuse)
+        ear = HealthMonitor(stage.plain, GraphWatch(stage.plain), watch, 0.0)
+        with pytest.raises(RuntimeError, match="out of memory"):
+            ear.state(60.0)
+    assert ear.state(60.1) is NoState.NOT_YET
+    assert ear.state(120.0) is NoState.NO_ANSWER
+    ear.close()
+
+
 @pytest.mark.parametrize("simulated", [True, False])
 def test_the_clock_of_a_node_is_that_which_the_node_uses(stage, simulated) -> None:
     """The slave asks the node, because a launch or parameter file may set `use_sim_time`."""

@@ -14,6 +14,7 @@ from collections.abc import Iterable, Sequence
 from importlib import import_module
 from typing import Any, Final
 
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.qos import qos_profile_services_default
 
@@ -85,18 +86,46 @@ class SimulatedClock:
         return self._newest
 
 
+class _Clients:
+    """Clients of a node's services; an invalid name has none, and so counts as no answer.
+
+    Attributes:
+        created: the clients.
+    """
+
+    def __init__(self, node: Node, kind: Any, names: Sequence[str], **options: Any) -> None:
+        self._node, self._kind, self._options = node, kind, options
+        self._missing = list(names)
+        self.created: list[Any] = []
+
+    def create(self) -> None:
+        """Create the missing clients.
+
+        An error of the middleware, as for want of memory, is raised, so that there is no
+        observation. Otherwise it would count as the silence of a node, which ends the node.
+        """
+        while self._missing:
+            with contextlib.suppress(NameValidationException):
+                client = self._node.create_client(self._kind, self._missing[0], **self._options)
+                self.created.append(client)
+            del self._missing[0]
+
+    def close(self) -> None:
+        """Destroy the clients."""
+        for client in self.created:
+            self._node.destroy_client(client)
+        self.created.clear()
+
+
 class _TimeMonitor:
     """Finds out whether a node has `use_sim_time`, from the node itself: files may set it too."""
 
     def __init__(self, node: Node, clock: SimulatedClock, names: Sequence[str]) -> None:
-        self._node, self._clock = node, clock
+        self._clock = clock
         self._services = import_module("rcl_interfaces.srv")
-        self._clients: list[Any] = []
+        self._clients = _Clients(node, self._services.GetParameters, names)
         self._asked = -math.inf
         self._is_simulated: bool | None = None  # None: the node has not answered yet
-        for name in names:
-            with contextlib.suppress(Exception):  # an invalid name counts as no answer
-                self._clients.append(node.create_client(self._services.GetParameters, name))
 
     def look(self, now: float) -> float | None:
         """Return the simulated time of the node; None: it has none, or has not answered yet."""
@@ -105,7 +134,8 @@ class _TimeMonitor:
         return self._clock.now() if self._is_simulated else None
 
     def _ask(self, now: float) -> None:
-        for client in self._clients:
+        self._clients.create()
+        for client in self._clients.created:
             with client.handle:
                 header, answer = client.handle.take_response(self._services.GetParameters.Response)
             if header is not None:
@@ -114,15 +144,13 @@ class _TimeMonitor:
                 return
         if now - self._asked >= _ASK_PERIOD:
             self._asked = now
-            for client in self._clients:
+            for client in self._clients.created:
                 request = self._services.GetParameters.Request(names=["use_sim_time"])
                 with client.handle:
                     client.handle.send_request(request)
 
     def close(self) -> None:
-        for client in self._clients:
-            self._node.destroy_client(client)
-        self._clients.clear()
+        self._clients.close()
 
 
 class _TopicMonitor:
@@ -202,28 +230,28 @@ class _TopicMonitor:
 
 class _StateMonitor:
     def __init__(self, node: Node, watch: Watch, now: float) -> None:
-        self._node = node
-        self._clients: list[Any] = []
         self._state: str | NoState = NoState.NOT_YET
         self._period = min(_ASK_PERIOD, watch.checks.timeout / _ASKS)
         self._asked = -math.inf
         self._answered = now
         self._kind = import_module("lifecycle_msgs.srv").GetState
-        for name in watch.services:
-            with contextlib.suppress(Exception):  # an invalid name counts as no answer
-                client = node.create_client(
-                    self._kind, name, qos_profile=qos_profile_services_default
-                )
-                self._clients.append(client)
+        self._clients = _Clients(
+            node, self._kind, watch.services, qos_profile=qos_profile_services_default
+        )
 
     def look(self, now: float) -> str | NoState:
-        for client in self._clients:
+        try:
+            self._clients.create()
+        except Exception:
+            self._answered = now  # the node could not be asked
+            raise
+        for client in self._clients.created:
             self._take_answer(client, now)
         if now - self._answered > self._period + _PATIENCE:
             self._state = NoState.NO_ANSWER
         if now - self._asked >= self._period:
             self._asked = now
-            for client in self._clients:
+            for client in self._clients.created:
                 with client.handle:
                     client.handle.send_request(self._kind.Request())
         return self._state
@@ -238,6 +266,4 @@ class _StateMonitor:
             self._state, self._answered = str(response.current_state.label), now
 
     def close(self) -> None:
-        for client in self._clients:
-            self._node.destroy_client(client)
-        self._clients.clear()
+        self._clients.close()
