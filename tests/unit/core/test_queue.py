@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from rosrm.core.master import events as happened
 from rosrm.model.orders import StopInstance
 from rosrm.model.records import Record
@@ -75,6 +77,34 @@ def test_a_process_too_large_for_every_host_is_set_aside() -> None:
         "needed: 944 MB; there is no other host"
     )
     assert cluster.restart("p").message.startswith("p is set aside: no host may take it: a has ")
+
+
+@pytest.mark.parametrize("way", ["drain", "cordon", "leave", "cut"])
+def test_the_reason_that_holds_for_good_comes_before_an_absence(way: str) -> None:
+    """The return of the hosts would not help the process."""
+    cluster = Cluster("a", "b").with_processes(process("p", memory=1 << 20))
+    large = "no host may take it: each of a and b has 17.2 GB of memory, of which 13.7 GB (80%) "
+    large += "may be used; needed: 1.1 TB"
+    assert cluster["p"].reason == large
+    for host in "ab":
+        if way == "leave":
+            cluster.leave(host)
+        elif way == "cut":
+            cluster.cut(host, seconds=60.0)
+        else:
+            cluster.set_host(host, way)
+    cluster.wait(1.0)
+    assert cluster["p"].reason == large
+
+
+def test_a_host_without_a_reading_is_away_not_without_memory() -> None:
+    """After a restart of the master, the resources of a host that does not report are unknown."""
+    cluster = Cluster("a", "b")
+    cluster.cut("b")
+    cluster.restart_master()
+    cluster.wait(60.0)
+    cluster.submit(process("p", memory=1 << 20))
+    assert cluster["p"].reason.endswith("needed: 1.1 TB; b is lost")
 
 
 def test_nothing_is_set_aside_before_the_limits_are_known(monkeypatch) -> None:

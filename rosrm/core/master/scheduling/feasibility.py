@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -13,8 +14,8 @@ from rosrm.core.master.scheduling.filters import (
     FILTERS,
     LINKS,
     NEIGHBOURS,
-    Filter,
     Lasts,
+    Refusal,
     passing,
     refusals,
 )
@@ -31,7 +32,10 @@ _NAMED_HOSTS: Final = 16
 _PERMANENT: Final = tuple(one for one in FILTERS if one.lasts is Lasts.PERMANENT)
 _AWAY: Final = tuple(one for one in FILTERS if one.lasts is Lasts.AWAY)
 _ABSENT: Final = tuple(one for one in FILTERS if one.lasts in (Lasts.AWAY, Lasts.RETURN))
-_LASTING: Final = tuple(one for one in FILTERS if one.lasts is not Lasts.MOMENT)
+_CHANGING: Final = (
+    EXCLUSION,
+    *(one for one in FILTERS if one.lasts not in (Lasts.PERMANENT, Lasts.MOMENT)),
+)
 
 
 def why_never(table: HostTable, demand: Demand) -> str:
@@ -48,7 +52,20 @@ def why_never(table: HostTable, demand: Demand) -> str:
     if unknown:
         return unknown
     alone = "; there is no other host" if len(table.listed()) == 1 else ""
-    return _host_by_host(_LASTING, table, demand) + alone
+    return _host_by_host(_longest_refusals, table, demand) + alone
+
+
+def _longest_refusals(hosts: Candidates) -> list[Refusal | None]:
+    """Return for each host the refusal that holds longest.
+
+    The resources of a host without a reading may be unknown; so its absence comes first.
+    """
+    pairs = zip(refusals(_PERMANENT, hosts), refusals(_CHANGING, hosts), strict=True)
+    unread = hosts.table.without_reading()[hosts.columns]
+    return [
+        changing or permanent if unknown else permanent or changing
+        for (permanent, changing), unknown in zip(pairs, unread, strict=True)
+    ]
 
 
 def a_known_host_may(table: HostTable, demand: Demand) -> bool:
@@ -77,7 +94,8 @@ def why_all_away(table: HostTable, demand: Demand) -> str:
     """Return why each host is away; "" if one of them is present."""
     if passing(_ABSENT, _every(table, demand)).any():
         return ""
-    return f"every host is away: {_host_by_host(_ABSENT, table, demand)}"
+    reasons = _host_by_host(partial(refusals, _ABSENT), table, demand)
+    return f"every host is away: {reasons}"
 
 
 def why_each_never(
@@ -111,12 +129,14 @@ def possible(table: HostTable, demand: Demand) -> BoolArray:
     return possible & there if there.any() else possible
 
 
-def _host_by_host(filters: Sequence[Filter], table: HostTable, demand: Demand) -> str:
-    """Return the first reason against each host, equal ones once."""
+def _host_by_host(
+    refused: Callable[[Candidates], list[Refusal | None]], table: HostTable, demand: Demand
+) -> str:
+    """Return the reason against each host, equal ones once."""
     listed = table.listed()
     named = listed[:_NAMED_HOSTS]
     columns = np.array([host.column for host in named], np.int64)
-    found = refusals(filters, as_if_empty(table, demand, columns))
+    found = refused(as_if_empty(table, demand, columns))
     summary = by_reason(
         (host.name, first_line(refusal.reason))  # `rosrm explain` has the details
         for host, refusal in zip(named, found, strict=True)
