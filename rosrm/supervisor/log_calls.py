@@ -6,9 +6,10 @@ A thread has the `LogKeeper`. Until a late folder answers, no log is opened, so 
 from __future__ import annotations
 
 import os
-from collections.abc import Collection
+from collections.abc import Mapping
 from functools import partial
 
+from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.rules import Key
 from rosrm.supervisor import paths
 from rosrm.supervisor.file_thread import Call, FileThread
@@ -24,9 +25,9 @@ class LogCalls:
         disk: the thread.
     """
 
-    def __init__(self, state: str, limits: LogLimits) -> None:
+    def __init__(self, state: str, limits: LogLimits, known: Mapping[Key, Instance]) -> None:
         self.disk = FileThread(paths.log_folder(state))
-        self._keeper = LogKeeper(state, limits)
+        self._keeper = LogKeeper(state, limits, known)
         self._opened: dict[Key, int] = {}  # descriptors for the loop
         self._known: set[Key] = set()  # instances with something to release
         self._due: float | None = None
@@ -42,7 +43,7 @@ class LogCalls:
             self._known.add(instance)
             self.disk.tell(partial(self._keeper.prepare, instance))
 
-    def open(self, instance: Key, known: Collection[Key]) -> int:
+    def open(self, instance: Key) -> int:
         """Open the log of a starting instance, see `LogKeeper.open`; `close` takes the descriptor.
 
         Raises:
@@ -50,12 +51,12 @@ class LogCalls:
             OSError: it cannot be opened.
         """
         self._known.add(instance)
-        self.disk.ask(partial(self._open, instance, known))
+        self.disk.ask(partial(self._open, instance))
         return self._opened.pop(instance)
 
-    def _open(self, instance: Key, known: Collection[Key]) -> None:
+    def _open(self, instance: Key) -> None:
         if instance not in self._opened:
-            self._opened[instance] = self._keeper.open(instance, known)
+            self._opened[instance] = self._keeper.open(instance)
 
     def close(self, log: int, stamps: str = "") -> None:
         """Close a log, which may wait for its disk; write the trace of a start before that."""
@@ -67,10 +68,10 @@ class LogCalls:
 
         self.disk.tell(close)
 
-    def note_adoption(self, instance: Key, known: Collection[Key], pid: int) -> None:
+    def note_adoption(self, instance: Key, pid: int) -> None:
         """Write into the log of an adopted process where its output goes."""
         self._known.add(instance)
-        self.disk.tell(partial(self._keeper.note_adoption, instance, known, pid))
+        self.disk.tell(partial(self._keeper.note_adoption, instance, pid))
 
     def watch(self, instance: Key, now: float, started: int = 0) -> None:
         """Begin to check the log of a running instance, see `LogKeeper.watch`."""

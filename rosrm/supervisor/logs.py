@@ -11,10 +11,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Collection, Container, Iterable
+from collections.abc import Container, Iterable, Mapping
 from typing import Final, NamedTuple
 
 from rosrm import clocks
+from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.rules import Key
 from rosrm.model.start_trace import LINE
 from rosrm.runtime.private_files import open_private
@@ -43,7 +44,7 @@ class LogLimits(NamedTuple):
         keep: older files beside the current one, for each instance.
         instances: instances of one process whose logs are kept.
         processes: processes whose logs are kept.
-        keep_bytes: of all logs; current files of running instances may exceed it.
+        keep_bytes: of all logs; files of instances that have not ended may exceed it.
     """
 
     max_bytes: int = 10 << 20
@@ -64,10 +65,18 @@ class LogLimits(NamedTuple):
 
 
 class LogKeeper:
-    """Opens, watches, rotates and removes the logs below one state directory."""
+    """Opens, watches, rotates and removes the logs below one state directory.
 
-    def __init__(self, state: str, limits: LogLimits) -> None:
+    Args:
+        state: the state directory.
+        limits: limits of the logs.
+        known: all instances of the supervisor, which may change them in another thread. Until an
+            instance has ended, its log stays, with the files that its next start needs.
+    """
+
+    def __init__(self, state: str, limits: LogLimits, known: Mapping[Key, Instance]) -> None:
         self.limits = limits
+        self._known = known
         self._state = state
         self._logs: dict[Key, _Log] = {}
         self._opened: dict[Key, int] = {}
@@ -90,8 +99,8 @@ class LogKeeper:
         with contextlib.suppress(OSError):  # `open` tries again, and reports the fault
             self._prepared[instance] = self._open(instance)
 
-    def open(self, instance: Key, known: Collection[Key]) -> int:
-        """Open the log of a starting instance; make room, but keep logs of `known` instances.
+    def open(self, instance: Key) -> int:
+        """Open the log of a starting instance, and make room for it.
 
         Raises:
             OSError: the log cannot be opened. An old log that cannot be removed prevents no start.
@@ -103,8 +112,8 @@ class LogKeeper:
         if log is None:
             log = self._open(instance)
         try:
-            self._folder.add(instance, known, self.limits)
-            self._folder.remove_old_processes(known, self.limits)
+            self._folder.add(instance, self._known, self.limits)
+            self._folder.remove_old_processes(self._known, self.limits)
         except OSError as error:
             own_log.write(f"an old log cannot be removed: {error}")
         return log
@@ -115,7 +124,7 @@ class LogKeeper:
         self._opened[instance] = os.fstat(log).st_size
         return log
 
-    def note_adoption(self, instance: Key, known: Collection[Key], pid: int) -> None:
+    def note_adoption(self, instance: Key, pid: int) -> None:
         """Write into the log of an adopted process where its output goes."""
         try:
             output = os.readlink(f"/proc/{pid}/fd/1")
@@ -126,7 +135,7 @@ class LogKeeper:
             "its output is here from its first restart on\n"
         )
         try:
-            log = self.open(instance, known)
+            log = self.open(instance)
             with open(log, "wb") as file:
                 file.write(os.fsencode(text))
         except OSError as error:
@@ -179,8 +188,9 @@ class LogKeeper:
         if self._unchecked < self.limits.keep_bytes // EXCESS_PART:
             return
         self._unchecked = 0
+        stay = [key for key, one in tuple(self._known.items()) if not one.ended]
         try:
-            self._folder.remove_excess([*self._logs, *self._prepared], self.limits.keep_bytes)
+            self._folder.remove_excess(stay, self.limits.keep_bytes)
         except OSError as error:
             own_log.write(f"an old log cannot be removed: {error}")
 
@@ -300,14 +310,14 @@ class LogFolder:
                 self._remove(name, number)
         self._left = len(self._numbers)
 
-    def remove_excess(self, running: Iterable[Key], keep_bytes: int) -> None:
+    def remove_excess(self, not_ended: Iterable[Key], keep_bytes: int) -> None:
         """Remove logs until their bytes are within a bound, those of old processes first.
 
-        First go the logs of instances that have ended, then the older files of running ones.
+        First go the logs of instances that have ended, then the older files of the others.
         """
         sizes = self._sizes()
         total = sum(map(sum, (files.values() for files in sizes.values())))
-        stay = {(paths.safe_name(process), number) for process, number in running}
+        stay = {(paths.safe_name(process), number) for process, number in not_ended}
         order = [(name, number) for name, numbers in self._numbers.items() for number in numbers]
         for name, number in order:
             if total > keep_bytes and (name, number) not in stay:

@@ -119,7 +119,7 @@ class Server:
         self.disk = FileThread(state)
         self._record = InstanceRecord(state, self.disk)
         self._last_contact = lease_file.LastContact(state, self.disk)
-        self._logs = LogCalls(state, limits)
+        self._logs = LogCalls(state, limits, self._core.instances)
         self._null = _open_null()
         self._launches: dict[Key, messages.Launch] = {}
         self._environments: dict[str, dict[str, str]] = {}
@@ -477,7 +477,7 @@ class Server:
         if not self._trees.take_over(key, leader):
             self._spawn_failed(key, adoption.ended(rule), transient=False)
             return
-        self._logs.note_adoption(key, self._core.instances, rule.pid)
+        self._logs.note_adoption(key, rule.pid)
         self._logs.watch(key, clocks.boot_time(), rule.pid)
         wanted = launch.limits.wanted
         note = f"adopted, so only its first restart applies {listed(wanted)}" if wanted else ""
@@ -489,7 +489,7 @@ class Server:
 
     def _open_log(self, key: Key) -> int:
         try:
-            return self._logs.open(key, self._core.instances)
+            return self._logs.open(key)
         except NoAnswer:
             raise
         except OSError as error:

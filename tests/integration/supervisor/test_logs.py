@@ -6,7 +6,7 @@ import pytest
 
 from rosrm.core.supervisor.events import StatusStored, StopOrdered
 from rosrm.errors import Refused
-from rosrm.model.values import InstanceId
+from rosrm.model.values import InstanceId, InstanceState, RestartPolicy
 from rosrm.slave.logs import newest_instance
 from rosrm.supervisor import log_index
 from rosrm.supervisor.logs import PROCESSES_AT_ONCE, LogLimits
@@ -108,3 +108,32 @@ def test_any_process_name_is_a_safe_file_name(host, name):
     host.run(client, host.order(name, "echo", "hello"))
     assert host.log(name).read_text() == "hello\n"
     assert host.state / "logs" in host.log(name).resolve().parents
+
+
+def test_the_bound_leaves_what_a_restart_needs(host):
+    """A supervisor ends while services wait for their restarts.
+
+    The next supervisor applies the bound after its first start; the other service still waits.
+    """
+    limits = LogLimits(max_bytes=64 * KIB, keep_bytes=100 * KIB)
+    client = host.connect(log=limits)
+    script = f"[ -e {host.state}/later ] && exec sleep 1000; head -c 50K /dev/zero; exit 1"
+    files = [host.log("waits", n).with_suffix(".parameters.yaml") for n in (1, 2)]
+    for number, file in enumerate(files, 1):
+        file.write_text("speed: 1\n")
+        restart = RestartPolicy("on-failure", delay=[4.0, 0.2][number - 1], attempts=100)
+        client.start([host.order("waits", "sh", "-c", script, number=number, restart=restart)])
+        host.wait(client, "waits", InstanceState.BACKOFF, number=number)
+    host.kill_supervisor(client)
+    (host.state / "later").touch()
+    with host.log("waits", 2).open("ab") as log:
+        log.write(bytes(10 * KIB))
+    client = host.connect(log=limits)
+    up: set[int] = set()
+    wait_until(
+        lambda: up.update(
+            one.instance.number for one in client.receive(1.0) if one.state is InstanceState.RUNNING
+        ) or up == {1, 2},
+        "both services", seen=lambda: up,
+    )  # fmt: skip
+    assert all(file.exists() for file in files)

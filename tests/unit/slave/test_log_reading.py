@@ -291,12 +291,12 @@ def test_newest_instance(tmp_path, log) -> None:
 @pytest.fixture
 def keeper(tmp_path):
     log_path(tmp_path, P).parent.mkdir(parents=True)
-    return LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+    return LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1), {})
 
 
 def start(keeper, pid, content=b""):
     key = (P.process, P.number)
-    program = keeper.open(key, ())
+    program = keeper.open(key)
     keeper.watch(key, 0.0, pid)
     os.write(program, content)
     os.close(program)
@@ -336,7 +336,7 @@ def test_offsets_continue_in_another_supervisor(tmp_path, keeper, died) -> None:
     start(keeper, 7, b"x" * 150)
     keeper.look(1e9)
     if died:
-        keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+        keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1), {})
         keeper.watch((P.process, P.number), 0.0)
     with log_path(tmp_path, P).open("ab") as program:
         program.write(b"y" * 120)
@@ -351,7 +351,7 @@ def test_a_log_that_was_cut_without_a_note_is_read_on(tmp_path, keeper) -> None:
     start(keeper, 7, b"first\n")
     keeper.look(1e9)
     log_path(tmp_path, P).write_bytes(b"2\n")
-    keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1))
+    keeper = LogKeeper(str(tmp_path), LogLimits(max_bytes=100, keep=1), {})
     keeper.watch((P.process, P.number), 0.0)
     keeper.look(2e9)
     assert everything(tmp_path) == (b"2\n", [(0, 6)])

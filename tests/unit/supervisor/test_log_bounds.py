@@ -7,6 +7,8 @@ import os
 
 import pytest
 
+from rosrm.core.supervisor.instance import Instance
+from rosrm.core.supervisor.rules import Key, RestartRule, StopRule
 from rosrm.supervisor import messages, paths
 from rosrm.supervisor.logs import LogKeeper, LogLimits
 
@@ -24,9 +26,13 @@ def total(folder) -> int:
     return sum(path.stat().st_size for path in folder.iterdir())
 
 
+def not_ended(*processes: str) -> dict[Key, Instance]:
+    return {(name, 1): Instance((name, 1), RestartRule(), StopRule()) for name in processes}
+
+
 def run(keeper, key, *outputs: int) -> None:
     """Run an instance that writes so many bytes before each look at its log."""
-    log = keeper.open(key, ())
+    log = keeper.open(key)
     keeper.watch(key, 0.0, 7)
     for size in outputs:
         os.write(log, b"x" * size)
@@ -36,7 +42,7 @@ def run(keeper, key, *outputs: int) -> None:
 
 def test_the_logs_of_the_oldest_processes_are_removed_first(tmp_path, folder):
     """A thousand jobs that end leave no more than the bound."""
-    keeper = LogKeeper(str(tmp_path), LIMITS)
+    keeper = LogKeeper(str(tmp_path), LIMITS, {})
     for number in range(40):
         run(keeper, (f"job{number}", 1), 900)
         (folder / f"job{number}.1.parameters.yaml").touch()
@@ -48,7 +54,7 @@ def test_the_logs_of_the_oldest_processes_are_removed_first(tmp_path, folder):
 
 def test_older_files_of_running_processes_are_removed_when_nothing_else_is_left(tmp_path, folder):
     """Current files stay: a process writes into its own."""
-    keeper = LogKeeper(str(tmp_path), LIMITS)
+    keeper = LogKeeper(str(tmp_path), LIMITS, not_ended("a", "b"))
     run(keeper, ("ended", 1), 500)
     keeper.release(("ended", 1))
     for name in ("a", "b"):
@@ -64,7 +70,7 @@ def test_older_files_of_running_processes_are_removed_when_nothing_else_is_left(
 
 def test_a_log_that_was_opened_ahead_stays(tmp_path, folder):
     """Its process is going to write into it."""
-    keeper = LogKeeper(str(tmp_path), LIMITS)
+    keeper = LogKeeper(str(tmp_path), LIMITS, not_ended("held"))
     keeper.prepare(("held", 1))
     for number in range(40):
         run(keeper, (f"job{number}", 1), 900)
@@ -78,7 +84,7 @@ def test_a_log_that_was_opened_ahead_stays(tmp_path, folder):
 def test_logs_of_a_former_supervisor_count(tmp_path, folder):
     for number in range(30):
         (folder / f"job{number:02}.1.log").write_bytes(b"x" * 1000)
-    keeper = LogKeeper(str(tmp_path), LIMITS)
+    keeper = LogKeeper(str(tmp_path), LIMITS, not_ended("new"))
     run(keeper, ("new", 1), 10)
     assert total(folder) <= LIMITS.keep_bytes
     assert (folder / "new.1.log").exists()

@@ -22,15 +22,15 @@ def state(tmp_path):
 
 def test_an_old_log_that_cannot_be_removed_prevents_no_start(state, monkeypatch, capfd):
     """The log of the new instance is opened, and no descriptor is lost."""
-    keeper = LogKeeper(state, LogLimits(instances=1))
-    os.close(keeper.open(("talker", 1), ()))
+    keeper = LogKeeper(state, LogLimits(instances=1), {})
+    os.close(keeper.open(("talker", 1)))
 
     def refuse(path: str) -> None:
         raise PermissionError(errno.EPERM, "Operation not permitted", path)
 
     monkeypatch.setattr(logs.os, "unlink", refuse)
     before = set(Path("/proc/self/fd").iterdir())
-    log = keeper.open(("talker", 2), ())
+    log = keeper.open(("talker", 2))
     assert os.write(log, b"hello\n") == 6
     os.close(log)
     left = set(Path("/proc/self/fd").iterdir())
@@ -40,10 +40,10 @@ def test_an_old_log_that_cannot_be_removed_prevents_no_start(state, monkeypatch,
 
 def test_a_log_that_was_opened_ahead_is_opened_again_if_a_user_removed_it(state):
     """Otherwise the output would go to a file without a name."""
-    keeper, path = LogKeeper(state, LogLimits()), Path(paths.log_file(state, "talker", 1))
+    keeper, path = LogKeeper(state, LogLimits(), {}), Path(paths.log_file(state, "talker", 1))
     keeper.prepare(("talker", 1))
     path.unlink()
-    log = keeper.open(("talker", 1), ())
+    log = keeper.open(("talker", 1))
     os.write(log, b"hello\n")
     os.close(log)
     assert path.read_text() == "hello\n"
@@ -51,18 +51,18 @@ def test_a_log_that_was_opened_ahead_is_opened_again_if_a_user_removed_it(state)
 
 def test_a_log_that_was_opened_ahead_displaces_no_log_before_its_start(state):
     """A held job that never starts has no log, so it takes the place of none."""
-    keeper = LogKeeper(state, LogLimits(instances=2))
+    keeper = LogKeeper(state, LogLimits(instances=2), {})
 
     def kept() -> list[str]:
         return sorted(path.name for path in Path(paths.log_folder(state)).iterdir())
 
     for number in (1, 2):
-        os.close(keeper.open(("job", number), ()))
+        os.close(keeper.open(("job", number)))
     keeper.prepare(("job", 3))
     keeper.release(("job", 3))
     assert kept() == ["job.1.log", "job.2.log"]
     keeper.prepare(("job", 4))
-    os.close(keeper.open(("job", 4), ()))
+    os.close(keeper.open(("job", 4)))
     assert kept() == ["job.2.log", "job.4.log"]
 
 
@@ -87,7 +87,7 @@ def test_an_index_without_room_stays_as_it_was(state, monkeypatch):
 
 def test_a_failed_release_of_a_log_is_reported(state, monkeypatch):
     """The caller logs it; otherwise the log would stay open, and no one would know."""
-    calls = LogCalls(state, LogLimits())
+    calls = LogCalls(state, LogLimits(), {})
     calls.prepare(("talker", 1))
 
     def fails(_keeper: LogKeeper, _instance: object) -> None:
