@@ -17,7 +17,6 @@ from rosrm.config.work import checked_defaults
 from rosrm.errors import ConfigError
 from rosrm.extensions.registry import Registry
 from rosrm.keys.roles import principal_of
-from rosrm.model.rows import PluginKind
 
 #: Sections that `_check_times` reads.
 _OF_TIME: Final = ("liveness", "control")
@@ -105,7 +104,6 @@ def _check_times(root: Node, config: ClusterConfig, problems: Problems) -> None:
 
 def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> ClusterConfig:
     """Return the settings with checked options of plugins, including plugins chosen by default."""
-    checkpoint = _checkpoint(root, config, plugins)
     named = root.get("migration", "strategies")
     if named is None:
         # Use the installed default strategies; if there is none, report the first as missing.
@@ -120,11 +118,7 @@ def _with_options(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Cl
         config,
         scoring=_scoring(root, config, plugins),
         filters=plugins.by_name("filter", root.get("filters")),
-        checkpoint=replace(
-            config.checkpoint,
-            policy=checkpoint,
-            options=_options(root, "checkpoint", checkpoint, plugins),
-        ),
+        checkpoint=replace(config.checkpoint, options=_checkpoint(root, config, plugins)),
         migration=replace(config.migration, strategies=strategies),
     )
 
@@ -173,24 +167,19 @@ def _check_chain(section: Node | None, problems: Problems) -> None:
             problems.add(place, text)
 
 
-def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> str | None:
-    """Return the given policy, or the default one if it is installed or its options are given."""
+def _checkpoint(root: Node, config: ClusterConfig, plugins: PluginCheck) -> Mapping[str, Any]:
+    """Return the checked options of the checkpoint policy.
+
+    The default one may be missing if the file gives neither its name nor options.
+    """
     policy, options = config.checkpoint.policy, root.get("checkpoint", "options")
-    if root.get("checkpoint", "policy") is not None or policy is None:
-        return policy
-    wanted = options is not None and bool(options.items)
-    return policy if wanted or plugins.has("checkpoint", policy) else None
+    named = root.get("checkpoint", "policy")
+    is_given = named is not None or (options is not None and bool(options.items))
+    if policy is None or not (is_given or plugins.has("checkpoint", policy)):
+        return {}
+    return plugins.choice("checkpoint", policy, named or root.get("checkpoint") or root, options)
 
 
 def _policy_in(link: Node) -> str | None:
     node = link.get("policy")
     return node.value if node is not None and isinstance(node.value, str) else None
-
-
-def _options(
-    root: Node, section: PluginKind, policy: str | None, plugins: PluginCheck
-) -> Mapping[str, Any]:
-    if policy is None:
-        return {}
-    named = root.get(section, "policy") or root.get(section) or root
-    return plugins.choice(section, policy, named, root.get(section, "options"))

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rosrm.config.placement import placement_of
-from rosrm.config.settings import CheckpointPolicySettings, ClusterConfig
+from rosrm.config.settings import ClusterConfig
 from rosrm.extensions.guard import Crash
 from rosrm.extensions.registry import MASTER_KINDS, Registry
 from rosrm.master.chain_creation import CREATION_LIMIT, ChainCreation
+from rosrm.master.checkpoint_policy import checkpoint_policy
 from rosrm.master.fallback_policy import fallback_of
 from rosrm.master.runtime import MasterRuntime
 from rosrm.master.settings_reload import SettingsReload
@@ -30,7 +31,7 @@ def new_runtime(
     registry.note_crashes(crashes)
     placement = placement_of(config, registry)
     strategies = registry.migrations(config.migration.strategies)
-    checkpoint = registry.checkpoint(_installed_policy(config, registry), config.checkpoint.options)
+    checkpoint = checkpoint_policy(registry, config.checkpoint)
     rows = registry.rows(*MASTER_KINDS)
     placement = replace(placement, fallback=fallback_of(registry, config))
     declared = registry.declared(config.migration.strategies)
@@ -40,13 +41,3 @@ def new_runtime(
         config, participant, placement, strategies, rows, checkpoint,
         declared=declared, reload=reload,
     )  # fmt: skip
-
-
-def _installed_policy(config: ClusterConfig, registry: Registry) -> str | None:
-    """Return the checkpoint policy, or None if it is the default one and not installed.
-
-    A policy that a file names was checked before, but the default may be missing.
-    """
-    policy = config.checkpoint.policy
-    is_default = policy == CheckpointPolicySettings().policy
-    return None if is_default and policy not in registry.names("checkpoint") else policy

@@ -79,7 +79,7 @@ def check(
 
 def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
     """Create the plugins that a master would create; raises `ConfigError` with all failures."""
-    wrong = []
+    wrong, checkpoint = [], _checkpoint_of(cluster, registry)
     plugins: list[tuple[str, Callable[[], object]]] = [
         *(("scoring", partial(registry.scoring, o.policy, o.options)) for o in cluster.scoring),
         *(("filters", partial(registry.filters, {n: o})) for n, o in cluster.filters.items()),
@@ -87,10 +87,7 @@ def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
             ("migration", partial(registry.migrations, {name: options}))
             for name, options in cluster.migration.strategies.items()
         ),
-        (
-            "checkpoint",
-            lambda: registry.checkpoint(cluster.checkpoint.policy, cluster.checkpoint.options),
-        ),
+        ("checkpoint", partial(registry.checkpoint, checkpoint, cluster.checkpoint.options)),
     ]
     for section, make in plugins:
         try:
@@ -99,6 +96,12 @@ def _make(file: Path, cluster: ClusterConfig, registry: Registry) -> None:
             wrong.append(f"{file}: {section}: {error}")
     if wrong:
         raise ConfigError("\n".join(wrong))
+
+
+def _checkpoint_of(cluster: ClusterConfig, registry: Registry) -> str | None:
+    """Return the checkpoint policy; None: there is none, or the default one is not installed."""
+    policy = cluster.checkpoint.policy
+    return policy if policy in registry.names("checkpoint") else None
 
 
 def _make_probes(file: Path, host: HostConfig, registry: Registry) -> None:
@@ -142,7 +145,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             filters = "".join(f"filter {name}, " for name in cluster.filters)
             return (
                 f"a cluster: scoring {cluster.chain}, {filters}migration {strategies}, "
-                f"checkpoint {cluster.checkpoint.policy or 'none'}"
+                f"checkpoint {_checkpoint_of(cluster, registry) or 'none'}"
             )
         case "host":
             host = checked_host(root, file, registry)
