@@ -3,8 +3,8 @@
 Bytes are appended only at the end of the stored log of a source, and that end is read from the
 file. So a crash at any moment loses no byte and stores none twice: the collector requests bytes
 again that were not written. A loss of power may leave the size of a file, or its newest blocks,
-without the bytes before: zeros. So appended bytes are forced to the disk, and zeros among the last
-ones are dropped at the start.
+without the bytes before: zeros. So appended bytes are forced to the disk, and those from a zero in
+the last append on are in doubt at the start: the host sends them again, if it still has them.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import gzip
 import os
 import zlib
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -59,17 +60,20 @@ class ArchiveWriter:
         self._directory, self._limits = directory, limits
         self.read_again()
         self._remove_remains()
-        self._drop_zeros()
 
     def read_again(self) -> None:
         """Read the segments again, e.g. after a user removed files; raises `OSError`."""
         self._segments = read_segments(self._directory)
         self._unchecked = self._limits.keep
+        self._doubted = {
+            source: zero for source, segment in self._stored()
+            if segment.is_open and (zero := _first_zero(segment)) >= 0
+        }  # fmt: skip
 
     def position(self, source: Source) -> int:
-        """Return the offset of the next byte of a source."""
+        """Return the offset of the next byte of a source, or of one in doubt: a zero."""
         last = self._last(source)
-        return last.end if last is not None else 0
+        return self._doubted.get(source, last.end) if last is not None else 0
 
     def newest_content(self, source: Source) -> tuple[int, bytes]:
         """Return offset and bytes of the newest segment of a source; raises `OSError`."""
@@ -101,6 +105,7 @@ class ArchiveWriter:
             raise ValueError(f"offset {part.offset}, but {position} bytes are stored")
         if not part.content:
             return
+        part = self._without_doubt(source, part)
         segment = self._open_at(source, part.offset)
         before = segment.room
         try:
@@ -113,8 +118,21 @@ class ArchiveWriter:
         if max(segment.end - segment.begin, log_index.size(str(segment.path))) >= SEGMENT_BYTES:
             self.close(source)
 
+    def _without_doubt(self, source: Source, part: LogPart) -> LogPart:
+        """Remove bytes in doubt that a part replaces; return the part without those that stay."""
+        zero, last = self._doubted.pop(source, -1), self._last(source)
+        if zero < 0 or last is None:
+            return part
+        if part.offset == zero:
+            os.truncate(last.path, zero - last.begin)
+            self._refresh(source, last)
+            return part
+        stored = max(0, last.end - part.offset)  # the host has dropped what is in doubt
+        return replace(part, offset=part.offset + stored, content=part.content[stored:])
+
     def close(self, source: Source) -> None:
         """Compress the open segment of a source, if it has bytes; raises `OSError`."""
+        self._doubted.pop(source, None)
         last = self._last(source)
         if last is None or not last.is_open or last.end == last.begin:
             return
@@ -216,20 +234,14 @@ class ArchiveWriter:
             if file not in expected and is_own_name(file.name):
                 file.unlink()
 
-    def _drop_zeros(self) -> None:
-        """Cut each open segment at zeros of its last append; the host sends what was there again.
 
-        Output that has zeros itself is sent again, too.
-        """
-        for source, segment in list(self._stored()):
-            begin = max(segment.begin, segment.end - _LONGEST_APPEND) - segment.begin
-            if segment.is_open and segment.end > segment.begin:
-                with os.fdopen(open_private(str(segment.path), os.O_RDWR), "rb+") as file:
-                    file.seek(begin)
-                    zero = file.read().find(b"\0")
-                    if zero >= 0:
-                        file.truncate(begin + zero)
-                self._refresh(source, segment)
+def _first_zero(segment: Segment) -> int:
+    """Return the offset of the first zero in the last append of an open segment; -1: none."""
+    begin = max(segment.begin, segment.end - _LONGEST_APPEND)
+    with segment.path.open("rb") as file:
+        file.seek(begin - segment.begin)
+        zero = file.read().find(b"\0")
+    return begin + zero if zero >= 0 else -1
 
 
 def _add_marks(segment: Segment, part: LogPart) -> None:

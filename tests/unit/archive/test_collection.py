@@ -220,6 +220,24 @@ def test_a_loss_of_power_during_an_append_leaves_no_zeros_and_doubles_nothing(ri
     assert rig.chunks() == [(0, b"one\ntwo\nthree\n")]
 
 
+@pytest.mark.parametrize("left", [0, 10], ids=["gone", "rotated"])
+def test_zeros_of_a_log_whose_host_has_them_no_more_stay(rig, left):
+    """Its own zeros, for example: nothing is removed for what nobody can send again."""
+    rig.alpha.write(b"one\n\0\0\0\0three\n")
+    rig.collect()
+    rig.alpha.write(b"four\n")
+    if left:
+        rig.alpha.rotate(keep=0)
+        rig.alpha.write(b"five\n")
+    else:
+        rig.master.silent.add(HOST)
+    rig.start()
+    rig.collect()
+    found = rig.chunks()
+    assert found[0] == (0, b"one\n\0\0\0\0three\n")
+    assert found[1:] == ([(19, b"five\n")] if left else [])
+
+
 def test_a_silent_host_is_named_once_and_collected_when_it_answers(rig, monkeypatch):
     rig.alpha.write(b"one\n")
     rig.master.silent.add(HOST)
