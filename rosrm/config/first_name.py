@@ -13,7 +13,9 @@ import socket
 from pathlib import Path
 from typing import Final
 
-from rosrm.runtime.private_files import open_private
+from rosrm.errors import ConfigError
+from rosrm.runtime import durable
+from rosrm.wording import reason_of
 
 _NOTE: Final = ".host"
 _MACHINE_ID: Final = Path("/etc/machine-id")
@@ -42,13 +44,8 @@ def keep_name(directory: Path, host: str) -> str:
     """
     name, kept = socket.gethostname(), _kept(directory)
     if not kept and host == name:
-        with (
-            contextlib.suppress(OSError),
-            os.fdopen(
-                open_private(str(directory / _NOTE), os.O_WRONLY | os.O_CREAT | os.O_TRUNC), "w"
-            ) as note,
-        ):
-            note.write(f"{_machine()} {name}\n")
+        with contextlib.suppress(OSError):
+            durable.replace_durably(str(directory / _NOTE), f"{_machine()} {name}\n".encode())
     if not kept or kept != host or kept == name:
         return ""
     return (
@@ -58,13 +55,26 @@ def keep_name(directory: Path, host: str) -> str:
 
 
 def _kept(directory: Path) -> str:
-    with contextlib.suppress(OSError, ValueError):
-        machine, name = (directory / _NOTE).read_text(encoding="utf-8").split()
-        return name if machine == _machine() else ""
-    return ""
+    words = _text_of(directory / _NOTE).split()
+    return words[1] if len(words) == 2 and words[0] == _machine() else ""
 
 
 def _machine() -> str:
-    with contextlib.suppress(OSError):
-        return _MACHINE_ID.read_text(encoding="ascii").strip() or "-"
-    return "-"
+    return _text_of(_MACHINE_ID).strip() or "-"
+
+
+def _text_of(path: Path) -> str:
+    """Return the text of a file; "": this user has no such file.
+
+    Raises:
+        ConfigError: it cannot be read now. The present name would be another host.
+    """
+    try:
+        return path.read_text(encoding="utf-8")
+    except (FileNotFoundError, NotADirectoryError, PermissionError, UnicodeDecodeError):
+        return ""
+    except OSError as error:
+        raise ConfigError(
+            f"{path}, which has the name of this host, cannot be read: {reason_of(error)}. Try "
+            f"again, or write `host: NAME` into host.yaml"
+        ) from None

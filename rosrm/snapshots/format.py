@@ -10,6 +10,8 @@ from mmap import mmap
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from rosrm.wording import reason_of
+
 #: Most bytes of a file, and most blocks; a larger file is no snapshot.
 LARGEST: Final = 2 << 30
 #: Most bytes of a replica: encryption adds a header, a nonce and a tag.
@@ -30,6 +32,18 @@ _CRC: Final = struct.Struct("<I")
 
 class Damaged(Exception):
     """A file holds no complete snapshot; the text gives the reason."""
+
+
+class Unreadable(Damaged):
+    """A file cannot be read now; its content may be sound, so it is not deleted.
+
+    Attributes:
+        error: of the file.
+    """
+
+    def __init__(self, error: OSError) -> None:
+        super().__init__(f"it cannot be read: {reason_of(error)}")
+        self.error = error
 
 
 class Block(NamedTuple):

@@ -15,11 +15,11 @@ from rosrm.snapshots.format import (
     Damaged,
     Head,
     Listing,
+    Unreadable,
     checked,
     decoded,
     decoded_head,
 )
-from rosrm.wording import reason_of
 
 #: Written by the node, in turn.
 SLOTS: Final = ("state.0", "state.1")
@@ -38,14 +38,24 @@ def peek(path: Path) -> Head | None:
         OSError: too many files are open, or memory is short; the snapshot may be there.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | OPEN)
+        return head_of(path)
     except OSError as error:
         raise_shortage(error)
         return None
+    except Damaged:
+        return None
+
+
+def head_of(path: Path) -> Head:
+    """Return the header of a file without reading its content.
+
+    Raises:
+        Damaged: the file has no sound header.
+        OSError: there is no file, or it cannot be read.
+    """
+    descriptor = os.open(path, os.O_RDONLY | OPEN)
     try:
         return decoded_head(os.read(descriptor, HEAD_ROOM))[0]
-    except (OSError, Damaged):
-        return None
     finally:
         os.close(descriptor)
 
@@ -95,7 +105,7 @@ def content_of(path: Path) -> bytes:
     """Return all bytes of a file.
 
     Raises:
-        Damaged: the file cannot be read.
+        Unreadable: the file cannot be read.
         OSError: too many files are open, or memory is short; the file may be sound.
     """
     try:
@@ -104,7 +114,7 @@ def content_of(path: Path) -> bytes:
             return file.read(min(os.fstat(descriptor).st_size, LARGEST_REPLICA))
     except OSError as error:
         raise_shortage(error)
-        raise Damaged(f"it cannot be read: {reason_of(error)}") from None
+        raise Unreadable(error) from None
 
 
 def newest(directory: Path, up_to: int) -> tuple[Listing | None, list[str]]:

@@ -17,8 +17,8 @@ from rosrm.snapshots.reader import (
     SLOTS,
     checked_replica,
     content_of,
+    head_of,
     paths_of,
-    peek,
 )
 
 #: A snapshot that is being written for a node before its start.
@@ -193,13 +193,19 @@ def write_slot(directory: Path, content: bytes) -> None:
 
 
 def drop_snapshots(directory: Path, up_to: int) -> bool:
-    """Delete the snapshots of instances up to a number; return True if none is left."""
+    """Delete the snapshots of instances up to a number; return True if none is left.
+
+    Raises:
+        OSError: a file cannot be read now, and may be of a later instance; it stays.
+    """
     left = False
     for path in paths_of(directory):
-        head = peek(path)
-        if head is not None and head.instance > up_to:
-            left = True
-        else:
+        try:
+            stays = head_of(path).instance > up_to
+        except (FileNotFoundError, Damaged):
+            stays = False
+        left |= stays
+        if not stays:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
     if not left:

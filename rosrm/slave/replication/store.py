@@ -14,11 +14,11 @@ from rosrm import clocks
 from rosrm.model.values import InstanceId, SnapshotReport
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
-from rosrm.shortage import exists, status
+from rosrm.shortage import exists, raise_shortage, status
 from rosrm.slave.replication.encryption import decrypted, encrypted
 from rosrm.slave.replication.keys import StateKeys
-from rosrm.snapshots.format import LARGEST_REPLICA, Damaged, Head, TransferPart
-from rosrm.snapshots.reader import COPY, newest_content, newest_head, peek, snapshot_files
+from rosrm.snapshots.format import LARGEST_REPLICA, Damaged, Head, TransferPart, Unreadable
+from rosrm.snapshots.reader import COPY, head_of, newest_content, newest_head, snapshot_files
 from rosrm.snapshots.writer import CopyWriter, drop_snapshots, write_slot
 from rosrm.wording import reason_of
 
@@ -137,11 +137,18 @@ class SnapshotStore:
             paths = sorted(self._root.iterdir())
         except FileNotFoundError:
             return []
+        found = []
         for path in paths:
-            if not exists(path):  # an old name of a directory whose snapshots were dropped
-                path.unlink(missing_ok=True)
-        found = ((path, status(path, follow_symlinks=False)) for path in paths)
-        return [path for path, one in found if one is not None and stat.S_ISDIR(one.st_mode)]
+            try:
+                if not exists(path):  # an old name of a directory whose snapshots were dropped
+                    path.unlink(missing_ok=True)
+                one = status(path, follow_symlinks=False)
+            except OSError as error:
+                raise_shortage(error)  # but a damaged directory hides no other
+                continue
+            if one is not None and stat.S_ISDIR(one.st_mode):
+                found.append(path)
+        return found
 
     def _rename(self, directory: Path, process: str) -> None:
         """Rename a directory to which an earlier release gave another name, and leave a link.
@@ -189,8 +196,11 @@ class SnapshotStore:
         """
         directory = self.directory(process)
         path, key = directory / COPY, self.keys.of(process)
-        copy = peek(path)
-        if copy is None or not (key or copy.encrypted):
+        try:
+            copy = head_of(path)
+        except (FileNotFoundError, Damaged):
+            return ""
+        if not (key or copy.encrypted):
             return ""
         own = self.newest_readable(process)
         is_older = own is not None and copy.age <= own.age
@@ -198,6 +208,8 @@ class SnapshotStore:
             return ""
         try:
             write_slot(directory, self._decrypted(key, path))
+        except Unreadable as fault:
+            raise fault.error from None
         except Damaged as fault:
             path.unlink(missing_ok=True)
             return str(fault)

@@ -10,6 +10,7 @@ from rosrm.config import first_name as module
 from rosrm.config.first_name import keep_name
 from rosrm.config.host import load_host
 from rosrm.config.settings import HostConfig, place_of_name
+from rosrm.errors import ConfigError
 from rosrm.slave.runtime import SlaveRuntime
 
 
@@ -48,6 +49,20 @@ def test_a_name_in_the_file_is_the_name_of_the_host(machine, file) -> None:
     assert load_host(file("host: second")).host == "second"
     assert started(load_host(file("{host: robot, state: there}"))) == ""
     assert load_host(file("state: there")).host == "second"
+
+
+def test_a_name_that_cannot_be_read_now_is_not_replaced(machine, file) -> None:
+    """With the present name of the machine, its processes would belong to a lost host."""
+    started(load_host(file("")))
+    machine.host = "second"
+    (note,) = place_of_name(HostConfig(host="first")).glob(".host")
+    note.rename(note.with_name("kept"))
+    note.mkdir()  # reading it fails as with a disk that fails
+    with pytest.raises(ConfigError, match=r"\.host, which has the name of this host"):
+        load_host(file(""))
+    note.rmdir()
+    note.with_name("kept").rename(note)
+    assert load_host(file("")).host == "first"
 
 
 def test_a_copied_disk_does_not_copy_the_name(machine) -> None:

@@ -210,6 +210,25 @@ def test_a_replica_that_cannot_be_written_for_the_node_stays(net, monkeypatch):
     assert messages(net, "not used for p#9: No space left on device")
 
 
+@pytest.mark.parametrize("headers", [0, 1], ids=["header", "content"])
+def test_a_replica_that_cannot_be_read_now_stays(net, monkeypatch, headers):
+    """The disk fails: the replica may be sound, and the only one."""
+    replicate(net, "b")
+    opened, right = [], os.open
+
+    def failing(path, *rest) -> int:
+        if str(path).endswith(f"/{reader.COPY}"):
+            opened.append(path)
+            if len(opened) > headers:
+                raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return right(path, *rest)
+
+    monkeypatch.setattr(os, "open", failing)
+    start(net, "b", "b")
+    assert copy_of(net, "b").exists()
+    assert messages(net, "not used for p#9: Input/output error")
+
+
 @pytest.mark.parametrize("lacks", [0, 1])
 def test_a_replica_waits_for_the_end_of_a_lack(net, monkeypatch, lacks):
     """A start without the replica would lose the state: its own snapshots would be newer."""

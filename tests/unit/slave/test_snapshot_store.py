@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import zlib
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rosrm import shortage
 from rosrm.ros.names import token
 from rosrm.ros.slave.replication import NotStored
 from rosrm.slave.replication import store as stores
@@ -254,6 +256,20 @@ def test_without_descriptors_replicas_are_refused_and_none_is_reported_as_lost(s
             shelf.store.scan()
     assert [one.instance.process for one in shelf.store.scan()] == ["p"]
     assert shelf.send("q", 7) == ""
+
+
+def test_a_directory_that_cannot_be_looked_at_hides_no_other(shelf, monkeypatch):
+    """The slave starts, and reports the snapshots of the other processes."""
+    shelf.send("p", 7)
+    shelf.send("q", 7)
+
+    def failing(path, **how):
+        if path == shelf.store.directory("p"):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return shortage.status(path, **how)
+
+    monkeypatch.setattr(stores, "status", failing)
+    assert [one.instance.process for one in shelf.store.scan()] == ["q"]
 
 
 def test_a_replica_that_cannot_be_checked_without_memory_leaves_no_open_file(shelf, monkeypatch):

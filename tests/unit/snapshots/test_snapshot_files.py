@@ -270,3 +270,12 @@ def test_links_are_not_followed(tmp_path):
     with pytest.raises(OSError, match="symbolic"):
         write(directory, 1, b"state")
     assert victim.read_bytes() == b"precious"
+
+
+def test_a_file_that_cannot_be_read_is_not_dropped(tmp_path) -> None:
+    """It may be of a later instance."""
+    (tmp_path / "state.0").mkdir()  # reading it fails as with a disk that fails
+    (tmp_path / "state.1").write_bytes(b"damaged")
+    with pytest.raises(OSError, match="directory"):
+        drop_snapshots(tmp_path, 7)
+    assert (tmp_path / "state.0").exists()
