@@ -15,6 +15,7 @@ from rosrm import clocks
 from rosrm.errors import Refused
 from rosrm.model.artifacts import LARGEST_ARTIFACT, is_digest
 from rosrm.model.ledger import Store, bound_of
+from rosrm.runtime import durable
 from rosrm.runtime.disk_space import room_for
 from rosrm.runtime.private_files import make_private_directory, open_private, write_all
 from rosrm.shortage import SHORTAGE
@@ -185,8 +186,7 @@ class ArtifactStore:
             self._end((sender, digest))
             raise _changed(digest)
         try:
-            os.fsync(upload.file)
-            upload.path.replace(self._root / digest)
+            durable.rename_durably(str(upload.path), str(self._root / digest))
         except OSError as error:
             self._end((sender, digest))
             raise _unwritable(upload.path, error) from None

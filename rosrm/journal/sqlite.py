@@ -20,7 +20,7 @@ from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import mapping_to_json
 from rosrm.model.records import Intent, Record, StoredRecord
-from rosrm.runtime.durable import rename_durably
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import make_private_directory, make_private_file
 
 #: Version of the tables; a file with another version is refused.
@@ -126,7 +126,7 @@ class SqliteJournal:
         with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as database:
             database.executescript(f"BEGIN; {_TABLES}; PRAGMA user_version={SCHEMA}; COMMIT;")
         make_private_file(new)
-        rename_durably(new, str(self._path))
+        durable.rename_durably(new, str(self._path))
 
     def _guarded(self, act: Callable[[], Any]) -> Any:
         try:
@@ -188,11 +188,18 @@ class SqliteJournal:
     def make_durable(self) -> None:
         """Force all that was written to the disk: it survives the loss of power.
 
+        The log itself is forced, because beside a reader SQLite's checkpoint may force nothing.
+
         Raises:
             JournalBlocked: a temporary failure; a retry is safe.
             JournalError: the file is damaged.
         """
-        self._guarded(lambda: self._database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone())
+
+        def force() -> None:
+            durable.sync(f"{self._path}-wal")
+            durable.sync_directory(str(self._path.parent))
+
+        self._guarded(force)
 
     def tables(self) -> list[str]:
         """Return the tables that have intents; raises `JournalError`."""

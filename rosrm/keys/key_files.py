@@ -11,8 +11,9 @@ import contextlib
 import fcntl
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from urllib.parse import quote
 
 import yaml
@@ -29,6 +30,8 @@ from rosrm.runtime.private_files import (
     open_private,
 )
 from rosrm.wording import reason_of
+
+_T = TypeVar("_T")
 
 #: File of the cluster's secret, on the master's machine alone.
 CLUSTER_FILE: Final = "cluster.key"
@@ -95,7 +98,8 @@ def rotate(home: Path, directory: Path) -> list[Path]:
         directory: for the key files; created if it is missing.
 
     Returns:
-        Paths of the key files, which are written before the secret is replaced.
+        Paths of the key files, which are on the disk before the secret is replaced, and get their
+        names after that.
 
     Raises:
         ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
@@ -107,14 +111,19 @@ def rotate(home: Path, directory: Path) -> list[Path]:
             directory / f"{one.principal.kind}-{quote(one.principal.name, safe='@')}.key": one
             for one in read_grants(home)
         }
-        with _former_keys_stay(f"the key files in {directory} are not"):
-            try:
-                make_safe_directory(directory)
-            except OSError as error:
-                raise ConfigError(f"{directory} cannot be used: {reason_of(error)}") from None
-            for path, grant in files.items():
-                write_key(path, secret.key_of(grant))
-            _write_secret(home, secret)
+        with ExitStack() as written:
+            with _former_keys_stay(f"the key files in {directory} are not"):
+                try:
+                    make_safe_directory(directory)
+                except OSError as error:
+                    raise ConfigError(f"{directory} cannot be used: {reason_of(error)}") from None
+                replacements = [
+                    written.enter_context(prepared_key(path, secret.key_of(grant)))
+                    for path, grant in files.items()
+                ]
+                _write_secret(home, secret)
+            for replace in replacements:
+                replace()
     return list(files)
 
 
@@ -130,17 +139,24 @@ def read_grants(home: Path) -> list[Grant]:
     return [grant for grant, revoked in _all_grants(home) if not revoked]
 
 
-def add_grant(
-    home: Path, principal: Principal, role: Role, hand_out: Callable[[Grant], None] | None = None
-) -> Grant:
+#: Writes a key for its receiver; yields what puts it in its place.
+HandOut = Callable[[Grant], AbstractContextManager[Callable[[], None]]]
+
+
+def _keep(_: Grant) -> AbstractContextManager[Callable[[], None]]:
+    return nullcontext(lambda: None)
+
+
+def add_grant(home: Path, principal: Principal, role: Role, hand_out: HandOut = _keep) -> Grant:
     """Give a principal a role and a new key; its former key becomes invalid.
 
     Args:
         home: directory of this user's keys.
         principal: that gets the key.
         role: of the principal.
-        hand_out: writes the key to its receiver, before the former key becomes invalid. It is
-            called without the lock, because an output can block.
+        hand_out: writes the key for its receiver, before the former key becomes invalid; what it
+            yields is called after that. It is entered without the lock, because an output can
+            block.
 
     Raises:
         ConfigError: a file is invalid, others can read it, or it cannot be written. Then the former
@@ -151,12 +167,13 @@ def add_grant(
     # The generation is random, because a counter would repeat that of a revoked key after the file
     # of the grants was lost or restored from a backup. Then that key would be valid again.
     grant = Grant(principal, role, 1 + secrets.randbelow(_GENERATIONS - 1))
-    with _former_keys_stay(f"the new key of {principal} is not"):
-        if hand_out is not None:
-            hand_out(grant)
-        with _locked(home):
-            others = [one for one in _all_grants(home) if one[0].principal != principal]
-            _write_grants(home, [*others, (grant, False)])
+    with ExitStack() as written:
+        with _former_keys_stay(f"the new key of {principal} is not"):
+            publish = written.enter_context(hand_out(grant))
+            with _locked(home):
+                others = [one for one in _all_grants(home) if one[0].principal != principal]
+                _write_grants(home, [*others, (grant, False)])
+        publish()
     return grant
 
 
@@ -231,7 +248,14 @@ def _fields_of(key: PrincipalKey) -> dict[str, Any]:
 
 
 def write_key(path: Path, key: PrincipalKey) -> None:
-    """Write a principal's key file.
+    """Write a principal's key file; raises `ConfigError` as `prepared_key`."""
+    with prepared_key(path, key) as replace:
+        replace()
+
+
+@contextlib.contextmanager
+def prepared_key(path: Path, key: PrincipalKey) -> Iterator[Callable[[], None]]:
+    """Write a principal's key file beside another one; yield what puts it in its place.
 
     Raises:
         ConfigError: the directory does not exist, or the file cannot be written.
@@ -245,7 +269,8 @@ def write_key(path: Path, key: PrincipalKey) -> None:
         ) from None
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from None
-    _write(path, _fields_of(key))
+    with _prepared(path, _fields_of(key)) as replace:
+        yield replace
 
 
 def read_key(path: Path) -> PrincipalKey:
@@ -388,11 +413,24 @@ def _text(fields: Mapping[str, Any]) -> str:
 
 def _write(path: Path, fields: Mapping[str, Any]) -> None:
     """Replace a file durably, with mode 0600: a revoked key stays revoked after a loss of power."""
+    with _prepared(path, fields) as replace:
+        replace()
+
+
+@contextlib.contextmanager
+def _prepared(path: Path, fields: Mapping[str, Any]) -> Iterator[Callable[[], None]]:
     content = _text(fields).encode()
     if len(content) > _LARGEST:
         raise ConfigError(f"{path} cannot be written: it would have more than {_LARGEST} bytes")
+    with ExitStack() as written:
+        prepared = durable.prepared(str(path), content)
+        replace = _writing(path, lambda: written.enter_context(prepared))
+        yield lambda: _writing(path, replace)
+
+
+def _writing(path: Path, write: Callable[[], _T]) -> _T:
     try:
-        durable.replace_durably(str(path), content)
+        return write()
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {reason_of(error)}") from None
 

@@ -13,6 +13,8 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Final
 
 from rosrm.runtime.private_files import open_private, write_all
@@ -39,18 +41,55 @@ def replace_atomically(path: str, content: bytes, flags: int = 0, mode: int = _P
     Raises:
         OSError: the file cannot be written.
     """
-    return _replace(path, content, flags, mode, is_durable=False)
+    new = f"{path}.new"
+    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
+    try:
+        if mode != _PRIVATE:
+            os.fchmod(file, mode)
+        write_all(file, content)
+        os.replace(new, path)
+    except OSError:
+        with contextlib.suppress(OSError):  # the first fault is the reason
+            os.close(file)
+        with contextlib.suppress(OSError):
+            os.unlink(new)
+        raise
+    return file
 
 
-def replace_durably(path: str, content: bytes, mode: int = _PRIVATE) -> None:
+def replace_durably(path: str, content: bytes) -> None:
     """Replace a file, as `replace_atomically`, and force the new one and its name to the disk.
 
     Raises:
         OSError: the file cannot be written. If its name cannot be forced to the disk, the new
             content is there nevertheless.
     """
-    os.close(_replace(path, content, 0, mode, is_durable=True))
-    sync_directory(os.path.dirname(path))
+    with prepared(path, content) as replace:
+        replace()
+
+
+@contextlib.contextmanager
+def prepared(path: str, content: bytes) -> Iterator[Callable[[], None]]:
+    """Force a new file to the disk; yield the function that puts it in the place of a file.
+
+    Without a call of the function the file is unchanged, and no part of the new one is left. The
+    function raises `OSError` as `replace_durably`.
+
+    Raises:
+        OSError: the new file cannot be written.
+    """
+    new = f"{path}.new"
+    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    try:
+        try:
+            write_all(file, content)
+            os.fsync(file)
+        finally:
+            os.close(file)
+        yield partial(_give_name, new, path)
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(new)
 
 
 def append_durably(path: str, content: bytes) -> None:
@@ -113,23 +152,9 @@ def sync_directory(path: str) -> None:
         os.close(directory)
 
 
-def _replace(path: str, content: bytes, flags: int, mode: int, *, is_durable: bool) -> int:
-    new = f"{path}.new"
-    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
-    try:
-        if mode != _PRIVATE:
-            os.fchmod(file, mode)
-        write_all(file, content)
-        if is_durable:
-            os.fsync(file)
-        os.replace(new, path)
-    except OSError:
-        with contextlib.suppress(OSError):  # the first fault is the reason
-            os.close(file)
-        with contextlib.suppress(OSError):
-            os.unlink(new)
-        raise
-    return file
+def _give_name(new: str, path: str) -> None:
+    os.replace(new, path)
+    sync_directory(os.path.dirname(path))
 
 
 def _sync_file(path: str) -> None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -85,12 +87,12 @@ def add(
     if out is None:
         _make_output_private()
 
-    def hand_out(grant: Grant) -> None:
+    def hand_out(grant: Grant) -> AbstractContextManager[Callable[[], None]]:
         made = secret.key_of(grant)
-        if out is None:
-            echo(key_files.text_of(made).rstrip())
-        else:
-            key_files.write_key(out, made)
+        if out is not None:
+            return key_files.prepared_key(out, made)
+        echo(key_files.text_of(made).rstrip())
+        return nullcontext(lambda: None)
 
     key_files.add_grant(home, named, Role(chosen), hand_out)
     former = "; its former key is no longer valid" if present else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import errno
 import os
 import stat
 from concurrent.futures import ThreadPoolExecutor
@@ -262,3 +263,38 @@ def test_an_invalid_grant_is_refused(tmp_path: Path, row: str) -> None:
     path.write_text(f"principals: [{row}]")
     with pytest.raises(ConfigError, match=r"principals\.yaml"):
         key_files.read_grants(tmp_path)
+
+
+@pytest.mark.parametrize("change", ["add", "rotate"])
+def test_a_change_that_cannot_be_stored_leaves_the_key_files_in_use(tmp_path, monkeypatch, change):
+    """Also where the new files replace those in use, a full disk leaves them valid."""
+    secret, principal = key_files.make_secret(tmp_path), principal_of("host:a")
+    path = tmp_path / "host-a.key"
+
+    def add() -> None:
+        key_files.add_grant(
+            tmp_path, principal, Role.HOST,
+            lambda grant: key_files.prepared_key(path, secret.key_of(grant)),
+        )  # fmt: skip
+
+    def is_valid() -> bool:
+        key = key_files.read_key(path)
+        (grant,) = key_files.read_grants(tmp_path)
+        return key == key_files.read_secret(tmp_path).key_of(grant)
+
+    add()
+    with monkeypatch.context() as patch:
+        stored, right = {"add": "principals.yaml", "rotate": "cluster.key"}[change], os.replace
+
+        def full(source, target, **where) -> None:
+            if target.endswith(stored):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            right(source, target, **where)
+
+        patch.setattr(os, "replace", full)
+        with pytest.raises(ConfigError, match="Former keys stay valid"):
+            add() if change == "add" else key_files.rotate(tmp_path, tmp_path)
+    assert is_valid()
+    assert not list(tmp_path.glob("*.new"))
+    add() if change == "add" else key_files.rotate(tmp_path, tmp_path)
+    assert is_valid()
