@@ -182,7 +182,13 @@ def _submit(cluster: UpCluster, specs: Sequence[ProcessSpec]) -> None:
     if new:
         _say(cluster.client.submit(new))
         content = json.dumps(former | {spec.name: digests[spec.name] for spec in new})
-        replace_durably(str(record), content.encode())
+        try:
+            replace_durably(str(record), content.encode())
+        except OSError as error:  # the processes run, and finished jobs may run again
+            _say(
+                f"{record} cannot be written: {reason_of(error)}; jobs that finish now run again "
+                f"at the next `rosrm up`"
+            )
 
 
 def _read_record(path: Path) -> dict[str, str]:

@@ -157,6 +157,14 @@ def test_a_kept_directory_runs_no_finished_job_again(tmp_path, capsys, kind, sta
         assert submitted(cluster, changed) == []
 
 
+def test_a_record_that_cannot_be_written_ends_no_cluster(tmp_path, capsys):
+    """The disk is full, for example: the processes run, and a line says what follows."""
+    (tmp_path / "submitted.json.new").mkdir()
+    cluster = SimpleNamespace(client=FakeClient(processes=[]), directory=tmp_path)
+    assert submitted(cluster, ProcessSpec("pick", command=("true",))) == ["pick"]
+    assert "submitted.json cannot be written" in capsys.readouterr().out
+
+
 def test_a_damaged_record_of_submitted_jobs_is_named(tmp_path):
     """Jobs of unknown entries would run again without a word."""
     (tmp_path / "submitted.json").write_text("[", encoding="utf-8")
