@@ -51,6 +51,7 @@ NO_STATE = {
     "tools/web/rosrm_web/metrics/command.py": "metrics, written again every few seconds",
 }
 _WRITES = {"write_bytes", "write_text", "touch", "symlink_to", "hardlink_to"}
+_DURABLE = re.compile(r"(replace|rename|append)_(durably|atomically)")
 _OPENS = {"open", "open_private", "fdopen"}
 _MOVES = {"rename", "replace", "link", "copyfile", "copytree", "copy2", "move"}
 _MODES = re.compile(r"'[wax]b?\+?'|'rb?\+b?'|O_CREAT|O_TRUNC|O_APPEND")
@@ -69,7 +70,9 @@ def _writes(call: ast.Call) -> bool:
         return owner == "sqlite3"
     if name == "touch":
         return "mode" in text or owner.startswith("(")
-    return name in _WRITES or (name in _MOVES and owner in {"os", "shutil"}) or owner == "durable"
+    if owner == "durable" or _DURABLE.fullmatch(name):
+        return True
+    return name in _WRITES or (name in _MOVES and owner in {"os", "shutil"})
 
 
 def _modules() -> list[str]:
