@@ -49,7 +49,7 @@ def test_after_a_restored_process_has_ended_its_command_runs(directory):
 
 def test_a_result_that_is_nested_deeply_is_no_result(directory):
     (directory / restore_result.FILE).write_text("[" * 100_000)
-    with pytest.raises(CriuError, match="cannot be read"):
+    with pytest.raises(CriuError, match="is damaged"):
         restore_result.read(directory)
     assert not restore_result.was_restored(directory)
 

@@ -82,17 +82,29 @@ def write(directory: Path, outcome: Outcome) -> None:
 
 
 def read(directory: Path) -> Outcome | None:
-    """Return the result; None: there is none yet. Raise CriuError if it cannot be read."""
+    """Return the result; None: there is none yet.
+
+    Raises:
+        CriuError: it is damaged.
+        OSError: no look is possible now, so the process may have been restored.
+    """
     try:
-        return Outcome(**json.loads((directory / FILE).read_text(encoding="utf-8")))
-    except FileNotFoundError:
+        text = (directory / FILE).read_bytes()
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    except (OSError, ValueError, TypeError, RecursionError) as error:
-        raise CriuError(f"{directory / FILE} cannot be read: {error}") from None
+    try:
+        return Outcome(**json.loads(text))
+    except (ValueError, TypeError, RecursionError) as error:
+        raise CriuError(f"{directory / FILE} is damaged: {error}") from None
 
 
 def was_restored(directory: Path) -> bool:
-    """Return True if a process was restored from an image, even if it has ended since."""
+    """Return True if a process was restored from an image, even if it has ended since.
+
+    Raises:
+        OSError: as `read`. A caller that took this for False would end the process, remove the only
+            record of its restore, or restore its image a second time.
+    """
     with contextlib.suppress(CriuError):
         outcome = read(directory)
         return outcome is not None and not outcome.reason
@@ -109,11 +121,18 @@ def wait(directory: Path, *, timeout: float, ended: Callable[[], bool] = lambda:
 
     Raises:
         CriuError: the restore failed, or there is no result in time.
+        OSError: no look at the result was possible until then, so the restore may have succeeded.
     """
     end = clocks.boot_time() + timeout
     while True:
-        is_over = ended()  # first, because a result written before the end is then found
-        outcome = read(directory)
+        try:
+            is_over = ended()  # first, because a result written before the end is then found
+            outcome = read(directory)
+        except OSError:
+            if clocks.boot_time() > end:
+                raise
+            time.sleep(_LOOK)
+            continue
         if outcome is not None:
             break
         if is_over:

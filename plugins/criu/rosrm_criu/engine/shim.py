@@ -70,9 +70,14 @@ def main() -> None:
     words, then = _split(sys.argv[1:])
     options = _options(words)
     directory = Path(options.directory).absolute()
-    if (then or options.remove) and restore_result.was_restored(directory):
-        if options.remove:
+    try:
+        is_used_up = (then or options.remove) and restore_result.was_restored(directory)
+        if is_used_up and options.remove:
             image.remove(directory)  # the rest that a SIGKILL of an earlier shim left
+    except OSError as error:  # the result stays as it is: the next start looks again
+        sys.stderr.write(f"not restored: {error}\n")
+        sys.exit(FAILED)
+    if is_used_up:
         _start_without_image(directory, then)
     # Signals that arrive during the restore stay pending; only SIGKILL takes effect at once.
     signal.pthread_sigmask(signal.SIG_BLOCK, _PASSED_ON)

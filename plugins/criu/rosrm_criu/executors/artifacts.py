@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm import threads
+from rosrm.shortage import exists
 from rosrm_criu.engine import image, process_tree, restore_result
 from rosrm_criu.engine.paths import checkpoint, incoming, numbers, outgoing
 from rosrm_criu.engine.restore_result import Outcome
@@ -144,14 +145,21 @@ def remove_unused_later(directory: Path, keep: float) -> None:
 
 def _remove_if_idle(directory: Path, keep: float) -> None:
     # The shim stays after the restore, and the image is then no longer needed.
-    if process_tree.has_shim(directory) and not restore_result.was_restored(directory):
-        remove_unused_later(directory, keep)
-    else:
-        remove_unused(directory)
+    try:
+        if not process_tree.has_shim(directory) or restore_result.was_restored(directory):
+            remove_unused(directory)
+            return
+    except OSError as error:
+        _log.warning("the image %s stays for %g s more: %s", directory, keep, error)
+    remove_unused_later(directory, keep)
 
 
 def remove_unused(directory: Path) -> None:
-    """Remove an image; if a process was restored from it, keep the result of the restore."""
+    """Remove an image; if a process was restored from it, keep the result of the restore.
+
+    Raises:
+        OSError: no look at the result is possible now; nothing was removed.
+    """
     if restore_result.was_restored(directory):
         image.remove(directory)  # its shim may have been killed before it removed the image
     else:
@@ -191,8 +199,11 @@ def forget_restored(state: Path, instances: Iterable[str]) -> None:
     here = set(map(number_of, instances))
     for number in numbers(state, "in"):
         directory = incoming(state, number)
-        if number not in here and _is_over(state, directory):
-            discard(directory)
+        try:
+            if number not in here and _is_over(state, directory):
+                discard(directory)
+        except OSError as error:
+            _log.warning("the result of the restore of %s stays: %s", directory, error)
 
 
 def note_origin(directory: Path, number: int) -> None:
@@ -201,14 +212,18 @@ def note_origin(directory: Path, number: int) -> None:
 
 
 def _is_over(state: Path, directory: Path) -> bool:
-    """Return True if a process was restored, and the checkpoint that was copied is gone."""
+    """Return True if a process was restored, and the checkpoint that was copied is gone.
+
+    Raises:
+        OSError: no look is possible now.
+    """
     if not restore_result.was_restored(directory):
         return False
     try:
         origin = int((directory / _ORIGIN).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+    except (FileNotFoundError, ValueError):
         return True
-    return not checkpoint(state, origin).exists()
+    return not exists(checkpoint(state, origin))
 
 
 def number_of(instance: str) -> int:

@@ -148,6 +148,10 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """Undo a restore: keep the original image, unless the process is already restored.
 
     A restore under way is awaited, because it must not be killed while it may succeed.
+
+    Raises:
+        CriuError: it has not succeeded in time, and is killed.
+        OSError: no look at its result is possible now; nothing was changed.
     """
     asked = StepArguments.of(arguments)
     directory = incoming(asked.state, asked.destination)

@@ -1,0 +1,137 @@
+"""A look that fails for want of a descriptor or memory tells nothing about a process or file."""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from itertools import count
+from pathlib import Path
+
+import pytest
+
+from rosrm_criu.engine import image, paths, process_tree, restore_result, shim
+from rosrm_criu.engine.restore_result import Outcome
+from rosrm_criu.executors import artifacts, checkpoint
+
+RESTORED = Outcome(pid=7, inner_pid=7)
+
+
+@pytest.fixture
+def sleeper() -> Iterator[subprocess.Popen[bytes]]:
+    """Yield a process that sleeps."""
+    with subprocess.Popen(["sleep", "100"]) as process:
+        yield process
+        process.kill()
+
+
+@pytest.fixture
+def fails(monkeypatch):
+    """Return a function that makes the next opens of a file fail."""
+    really = io.open
+
+    def fail(path: Path, *, times: int = 1, number: int = errno.EMFILE) -> None:
+        calls = count()
+
+        def opening(file, *rest, **named):
+            if str(file) == str(path) and next(calls) < times:
+                raise OSError(number, os.strerror(number), str(path))
+            return really(file, *rest, **named)
+
+        monkeypatch.setattr(io, "open", opening)
+
+    return fail
+
+
+# --- the result of a restore --------------------------------------------------------------------
+
+
+@pytest.fixture
+def result(tmp_path: Path) -> Path:
+    """Return the result of a restore that succeeded; its image is removed."""
+    directory = paths.incoming(tmp_path, 2)
+    directory.mkdir(mode=0o700, parents=True)
+    restore_result.write(directory, RESTORED)
+    return directory / restore_result.FILE
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.EACCES])
+def test_a_result_that_cannot_be_looked_at_is_none_of_any_kind(result, fails, number):
+    fails(result, number=number)
+    with pytest.raises(OSError, match=os.strerror(number)):
+        restore_result.was_restored(result.parent)
+    assert restore_result.was_restored(result.parent)
+
+
+def test_a_wait_for_a_result_looks_again(result, fails):
+    fails(result, times=3)
+    assert restore_result.wait(result.parent, timeout=20.0, ended=lambda: True) == RESTORED
+    fails(result, times=1_000_000)
+    with pytest.raises(OSError, match="Too many open files"):
+        restore_result.wait(result.parent, timeout=0.05, ended=lambda: True)
+
+
+@pytest.mark.parametrize("times", [1, 1_000_000])
+def test_a_restored_process_is_not_killed(result, fails, tmp_path, sleeper, times):
+    """Unless its result is seen, neither the process nor the checkpoint is given up."""
+    kept = paths.checkpoint(tmp_path, 1)
+    image.create(kept)
+    asked = {
+        "here": {
+            "host": "a", "state": str(tmp_path), "pids": {"x#2": sleeper.pid},
+            "instances": ["x#2"], "options": {},
+        },
+        "process": "x", "source": 1, "destination": 2, "attempt": "t", "timeout": 0.1,
+    }  # fmt: skip
+    fails(result, times=times)
+    if times > 1:
+        with pytest.raises(OSError, match="Too many open files"):
+            checkpoint.put_back(asked)
+        assert kept.exists()
+        fails(result, times=0)
+    assert checkpoint.put_back(asked) == {"active": True}
+    assert process_tree.is_alive(sleeper.pid)
+    assert restore_result.read(result.parent) == RESTORED
+
+
+def test_a_restart_does_not_lose_the_result(result, fails, monkeypatch, capsys):
+    """The restart policy starts the shim again, which then runs the command."""
+    words = restore_result.command(
+        sys.executable, result.parent, criu=Path("/none"), remove=True, timeout=5.0,
+        then=("echo", "started"),
+    )  # fmt: skip
+    monkeypatch.setattr(sys, "argv", ["shim.py", *words[5:]])
+    fails(result, number=errno.ENFILE)
+    with pytest.raises(SystemExit) as ended:
+        shim.main()
+    assert ended.value.code == shim.FAILED
+    assert "Too many open files in system" in capsys.readouterr().err
+    again = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
+    assert again.stdout == "started\n"
+
+
+def test_a_result_is_kept_until_it_was_seen(result, fails, monkeypatch):
+    later = []
+    monkeypatch.setattr(artifacts, "call_later", lambda *call: later.append(call))
+    for remove in (artifacts.remove_unused, lambda one: artifacts._remove_if_idle(one, 1.0)):
+        fails(result)
+        if remove is artifacts.remove_unused:
+            with pytest.raises(OSError, match="Too many open files"):
+                remove(result.parent)
+        else:
+            remove(result.parent)
+        assert restore_result.read(result.parent) == RESTORED
+    assert [do for _, do, *_ in later] == [artifacts._remove_if_idle]
+
+
+@pytest.mark.parametrize("name", [restore_result.FILE, "of"])
+def test_a_sweep_keeps_a_result_that_it_cannot_look_at(result, fails, tmp_path, name):
+    """While its checkpoint is kept, the result tells that the image was used."""
+    image.create(paths.checkpoint(tmp_path, 1))
+    artifacts.note_origin(result.parent, 1)
+    fails(result.parent / name)
+    artifacts.forget_restored(tmp_path, [])
+    assert restore_result.was_restored(result.parent)
