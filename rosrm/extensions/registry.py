@@ -354,13 +354,20 @@ class Registry:
         """Return a function as `capabilities_of`, which raises `PluginError` if a strategy fails.
 
         A start needs it, because without its launcher the process would be another one. A host
-        that lacks the strategy of a process has none of its launchers either.
+        where the strategy of a process is not installed has none of its launchers either, but a
+        plugin that does not load may offer both.
         """
         options = self._options(chosen)
 
         def found(spec: ProcessSpec) -> Capabilities:
             name = spec.migration.strategy or ""
             if ("migration", name) not in self._offers:
+                might = self._might_offer("migration", name) if name else []
+                if might:
+                    raise PluginError(
+                        f"a plugin that does not load here may offer it; correct it, and start "
+                        f"the slave again: {_faults(might)}"
+                    )
                 return _NO_CAPABILITIES
             declared = self._strategy(name).capabilities
             if isinstance(declared, Capabilities):
@@ -654,6 +661,10 @@ class Registry:
             f"unknown {title} {name!r}{meant} {installed}{self._broken_note(kind, name)}"
         )
 
+    def _might_offer(self, kind: PluginKind, name: str) -> list[Broken]:
+        """Return the broken plugins that may have an offer of this name if they load."""
+        return [b for b in self._broken if b.kind in ("", kind) and b.name in ("", name)]
+
     def _broken_note(self, kind: PluginKind, name: str = "") -> str:
         """Return the faults of the broken plugin that may be meant, and the number of the others.
 
@@ -665,8 +676,7 @@ class Registry:
             meant = [b for b in might if not b.name and _is_named_like(b.source, name)]
         if not meant:  # any plugin without a known offer may be meant
             meant = [b for b in might if not b.name][:_MOST_BROKEN]
-        reasons = dict.fromkeys(f"{b.source}: {b.reason}" for b in meant)
-        note = " Broken: " + "; ".join(reasons) + "." if reasons else ""
+        note = f" Broken: {_faults(meant)}." if meant else ""
         others = len(might) - len(meant)
         if not others:
             return note
@@ -683,6 +693,10 @@ def _fault_beside(listed: ProbeList, drafted: DraftedProbe) -> str:
     fault = listed.fault_of(drafted)
     kind = type(drafted.probe)
     return f"{kind.__name__} ({definition(kind)}) {fault}" if fault else ""
+
+
+def _faults(broken: Iterable[Broken]) -> str:
+    return "; ".join(dict.fromkeys(f"{one.source}: {one.reason}" for one in broken))
 
 
 def _is_named_like(source: PluginSource, name: str) -> bool:

@@ -19,6 +19,7 @@ from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessS
 from rosrm.slave import sessions
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.sessions import SessionTable
+from tests import plugin_kit
 
 
 class Wrapper:
@@ -285,6 +286,31 @@ def test_a_plugin_brings_a_launcher_that_its_strategy_declares():
     assert own.prepare(launch("moves")).argv == ("wrap", "x")
     assert own.variables == ("OURS",)
     assert [(row.name, row.state) for row in known.rows("launcher")] == [("ours", "selected")]
+
+
+@pytest.mark.parametrize(
+    "answers",
+    [
+        {"register_migration_strategies": OSError("Too many open files")},
+        {"register_migration_strategies": [MigrationOffer("moves", None)]},
+    ],
+)
+def test_a_process_does_not_start_without_the_launcher_of_a_strategy_that_does_not_load(answers):
+    """By its plain command it would run outside of its sandbox."""
+    known = Registry.of(mine=plugin_kit.plugin(**answers))
+    assert known.names("migration") == ()
+    own = Launchers(capabilities_of=known.capabilities_or_fault())
+    with pytest.raises(
+        LaunchError, match=r"strategy 'moves' is not known: .* may offer it; .*'mine'"
+    ):
+        own.prepare(launch("moves"))
+    assert own.prepare(launch()).argv == ("x",)
+
+
+def test_a_host_without_the_plugin_of_a_strategy_has_none_of_its_launchers():
+    """Such a process starts by its plain command, as on each host without the plugin."""
+    own = Launchers(capabilities_of=Registry.of().capabilities_or_fault())
+    assert own.prepare(launch("moves")).argv == ("x",)
 
 
 def test_a_launcher_that_cannot_be_made_is_named_with_the_reason():
