@@ -582,7 +582,7 @@ class SlaveRuntime:
         failing = self._endpoint.failing
         for plugin in [one for one in failing if one[0] != "probe"]:
             del failing[plugin]
-        failing.update({("launcher", name): why for name, why in self._launchers.broken.items()})
+        failing.update({("launcher", name): why for name, why in self._launchers.failing.items()})
         failing.update(self._executors.failing_plugins())
         failing.update({plugin: one.error for plugin, one in self._calls.failing.items()})
 

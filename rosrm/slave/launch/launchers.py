@@ -92,6 +92,11 @@ class Launchers:
             _log.info("launcher %s is %s", name, reason)
 
     @property
+    def failing(self) -> dict[str, str]:
+        """Return the name of each launcher that is not, or not yet, created, with the reason."""
+        return self.broken | dict.fromkeys(self.awaited, "its `create` has not returned yet")
+
+    @property
     def variables(self) -> tuple[str, ...]:
         """Environment variables that launchers set."""
         return tuple(variable for one in self.made.values() for variable in one.variables)

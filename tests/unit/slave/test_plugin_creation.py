@@ -182,8 +182,10 @@ def test_questions_to_a_launcher_that_is_not_created_have_no_answer() -> None:
     wait(one)
     assert (launchers.has_departed(10), launchers.members(10)) == (None, None)
     assert launchers.made == {}
+    assert launchers.failing == {"ours": "its `create` has not returned yet"}
     slow.is_open.set()
     take_late(one)
+    assert launchers.failing == {}
     assert (launchers.has_departed(10), launchers.members(10)) == (True, (10, 11))
     assert (launchers.has_departed(30), launchers.members(30)) == (False, ())
 
