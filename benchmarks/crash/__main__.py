@@ -60,7 +60,7 @@ def _states(
 
 
 def _digest(state: State, part: str) -> bytes:
-    """Return a digest of one part of a state, with what the user was told."""
+    """Return a digest of one part of a state, with the answers that its user had."""
     found = hashlib.blake2b(digest_size=16)
     for path in sorted(state.entries):
         if path.startswith(part):

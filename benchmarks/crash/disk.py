@@ -105,7 +105,7 @@ def _applied(content: bytes, writes: list[tuple[int, bytes | None]]) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """What the disk may hold.
+    """Possible content of the disk.
 
     Attributes:
         entries: path to content, None for a directory, a text for a symbolic link.

@@ -1,7 +1,7 @@
-"""What must hold after a loss of power: the promises of the documentation, checked by each reader.
+"""Promises of the documentation after a loss of power, checked by the reader of each part.
 
-Each check starts the real reader on a state of the disk, and compares what it makes of it with what
-the user was told before.
+Each check starts the real reader on a state of the disk, and compares the result with the answers
+that the user had before.
 """
 
 from __future__ import annotations
@@ -165,7 +165,7 @@ class Oracle:
 
 
 def _told(state: State, verb: str) -> set[str]:
-    """Return the names of which the user was told this."""
+    """Return the names about which the user had this answer."""
     words = (line.split() for line in state.told)
     return {name for what, name in words if what == verb}
 

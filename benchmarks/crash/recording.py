@@ -81,7 +81,7 @@ class Recording:
         }  # fmt: skip
 
     def mark(self, text: str) -> None:
-        """Note that the scenario has been told this."""
+        """Note an answer that the scenario has got."""
         self._add(MARK, text, 0)
 
     def make(self, *names: str) -> None:

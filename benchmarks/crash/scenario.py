@@ -1,4 +1,4 @@
-"""A real cluster whose writes are recorded, and what its user was told meanwhile."""
+"""A real cluster whose writes are recorded, with the answers that its user gets."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Places:
 
 
 class Scenario:
-    """Steps of a user; each one marks what it was told."""
+    """Steps of a user; each one marks its answer."""
 
     def __init__(self, recording: Recording, cluster: LocalCluster, places: Places) -> None:
         self._recording = recording
@@ -175,7 +175,7 @@ class Scenario:
 
 @contextmanager
 def _variables(variables: dict[str, str]) -> Iterator[None]:
-    """Give variables to the processes that are started meanwhile."""
+    """Give variables to the processes that are started in this context."""
     former = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
