@@ -20,6 +20,7 @@ from typing import Any, Final
 
 from rosrm import clocks
 from rosrm.errors import JournalBlocked, JournalError
+from rosrm.journal.errors import fault_of
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.records import Intent, Record
@@ -50,8 +51,9 @@ _NO_NUMBER: Final = 2**53
 
 @dataclass(slots=True)
 class _Found:
-    """The readable rows as stored: intents by table and key, events by sequence."""
+    """The readable rows of a file as stored: intents by table and key, events by sequence."""
 
+    copy: Path
     intents: dict[tuple[str, str], dict[str, Any]] = field(default_factory=dict)
     events: dict[int, tuple[Any, ...]] = field(default_factory=dict)
     whole: bool = True
@@ -81,6 +83,7 @@ def recover(path: Path, wall: Callable[[], float] = clocks.wall_time) -> str:
 
 
 def _recover(path: Path, wall: Callable[[], float]) -> str:
+    _undo_interrupted(path)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix="recovery-") as place:
         found = _salvage(path, Path(place))
         new = Path(place) / "new.sqlite"
@@ -88,11 +91,27 @@ def _recover(path: Path, wall: Callable[[], float]) -> str:
         _write(new, found, aside)
         # A journal must exist at every moment: a master without one stops every process.
         os.link(path, aside)
-        for suffix in _BESIDE:
-            with contextlib.suppress(FileNotFoundError):
-                Path(f"{path}{suffix}").replace(f"{aside}{suffix}")
-        rename_durably(str(new), str(path))
+        try:
+            _move_beside(path, aside)
+            rename_durably(str(new), str(path))
+        except OSError:
+            _undo_interrupted(path)
+            raise
     return _summary(found, str(aside))
+
+
+def _undo_interrupted(path: Path) -> None:
+    """Return to a damaged journal the files beside it that an unfinished recovery moved away."""
+    same = [one for one in path.parent.glob(f"{path.name}.damaged-*") if one.samefile(path)]
+    for aside in same:
+        _move_beside(aside, path)
+        aside.unlink()
+
+
+def _move_beside(source: Path, target: Path) -> None:
+    for suffix in _BESIDE:
+        with contextlib.suppress(FileNotFoundError):
+            Path(f"{source}{suffix}").replace(f"{target}{suffix}")
 
 
 def _not_recovered(path: Path, error: BaseException) -> JournalError:
@@ -126,7 +145,7 @@ def _salvage(path: Path, place: Path) -> _Found:
         with contextlib.suppress(FileNotFoundError):
             shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
     _fill_up(copy)
-    found = _Found()
+    found = _Found(copy)
     with contextlib.closing(sqlite3.connect(copy)) as database:
         database.text_factory = lambda raw: raw.decode(errors="replace")
         _read_events(database, found)
@@ -173,10 +192,12 @@ def _read_intents(database: sqlite3.Connection, found: _Found) -> None:
 def _rows(
     database: sqlite3.Connection, found: _Found, query: str, *values: object
 ) -> Iterator[tuple[Any, ...]]:
-    """Return the rows up to the first unreadable one."""
+    """Return the rows up to the first unreadable one; a shortage is no damage, and raises."""
     try:
         yield from database.execute(query, values)
-    except sqlite3.Error:
+    except sqlite3.Error as error:
+        if isinstance(fault_of(found.copy, error), JournalBlocked):
+            raise
         found.whole = False
 
 
@@ -188,12 +209,29 @@ def _write(path: Path, found: _Found, aside: Path) -> None:
             f"INSERT INTO record VALUES ({', '.join('?' * 8)})",  # noqa: S608 - fixed words
             [found.events[sequence] for sequence in sorted(found.events)],
         )
-    journal = SqliteJournal(path, keep_events=_MOST_EVENTS)  # the master's own bound holds later
     intents = [Intent(table, key, value) for (table, key), value in found.intents.items()]
-    journal.write(
-        [Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside.name))], intents, 0.0
-    )
-    journal.close()
+    note = Record(EventKind.JOURNAL_RECOVERED, message=_summary(found, aside.name))
+    # The master's own bound on events holds later.
+    with contextlib.closing(SqliteJournal(path, keep_events=_MOST_EVENTS)) as journal:
+        journal.write([note], intents, 0.0)
+    _complete(path, len(intents), len(found.events) + 1)
+
+
+def _complete(path: Path, intents: int, events: int) -> None:
+    """Move all rows from the write-ahead log into the file, as only the file gets the new name.
+
+    The close of a journal ignores that the disk has no room for them; a change of the mode does
+    not.
+    """
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        (mode,) = database.execute("PRAGMA journal_mode=DELETE").fetchone()
+        (verdict,) = database.execute("PRAGMA integrity_check(1)").fetchone()
+        counts = [
+            database.execute(f"SELECT count(*) FROM {table}").fetchone()[0]  # noqa: S608
+            for table in ("intent", "record")
+        ]
+    if (mode, verdict, counts) != ("delete", "ok", [intents, events]):
+        raise sqlite3.DatabaseError(f"the new journal is incomplete ({mode}, {verdict}, {counts})")
 
 
 def _add_lost_rows(found: _Found) -> None:

@@ -26,12 +26,13 @@ class Disk:
         self.place = place
         self._filler = place / "filler"
 
-    def fill(self) -> None:
-        """Fill the file system until not one more byte fits."""
+    def fill(self, but: int = 0) -> None:
+        """Fill the file system, until only `but` more bytes fit."""
         with self._filler.open("ab", buffering=0) as filler:
             for size in (65536, 4096, 1):
                 while self._fits(filler, size):
                     pass
+            filler.truncate(filler.tell() - but)
 
     @staticmethod
     def _fits(filler, size: int) -> bool:
@@ -43,7 +44,7 @@ class Disk:
             return False
 
     def make_room(self) -> None:
-        self._filler.unlink()
+        self._filler.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import signal
 import sqlite3
 from pathlib import Path
@@ -14,7 +15,8 @@ from rosrm.config.settings import LivenessSettings
 from rosrm.errors import JournalError, NoMaster, Refused
 from rosrm.journal.recovery import recover
 from rosrm.journal.sqlite import SqliteJournal
-from rosrm.model.records import Intent
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.records import Intent, Record
 from tests.faults.disks import small_disk
 from tests.ros.clusters import alive, clusters, host, job, service
 from tests.waiting import PATIENCE, wait_gone, wait_until
@@ -205,6 +207,41 @@ def test_a_damaged_journal_on_a_full_disk_is_left_as_it_is(tmp_path) -> None:
         assert not list(disk.place.glob("recovery-*"))
         disk.make_room()
         assert "was recovered" in recover(path)
+
+
+def test_a_recovery_has_all_rows_or_leaves_the_journal_as_it_is(tmp_path) -> None:
+    """The room may suffice for the new journal, but not for the end of its write-ahead log."""
+    with small_disk(tmp_path / "disk", size="8m") as disk:
+        path = disk.place / "state" / "journal.sqlite"
+        journal = SqliteJournal(path)
+        intents = [
+            Intent("process", f"p{n:03}", {"instances": {}, "x": "y" * 2000}) for n in range(100)
+        ]
+        journal.write([Record(EventKind.ASSIGNED, "p")], intents, 0.0)
+        journal.close()
+        raw = bytearray(path.read_bytes())
+        with contextlib.closing(sqlite3.connect(path)) as database:
+            query = "SELECT rootpage FROM sqlite_master WHERE name = 'record_process'"
+            (page,) = database.execute(query).fetchone()
+        raw[(page - 1) * 4096 : page * 4096] = bytes(4096)
+        outcomes = set()
+        for pages in range(len(raw) // 4096, len(raw) * 4 // 4096, 8):
+            shutil.rmtree(path.parent)
+            path.parent.mkdir(mode=0o700)
+            path.write_bytes(raw)
+            disk.fill(but=pages * 4096)
+            try:
+                recover(path)
+            except JournalError:
+                outcomes.add("unchanged")
+                assert path.read_bytes() == raw
+            else:
+                outcomes.add("recovered")
+                disk.make_room()
+                with contextlib.closing(SqliteJournal(path)) as journal:
+                    assert len(journal.intents("process")) == len(intents), pages
+            disk.make_room()
+        assert outcomes == {"unchanged", "recovered"}
 
 
 # --- a journal stall --------------------------------------------------------------------------

@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import os
 import sqlite3
+from unittest import mock
 
 import pytest
 
 from rosrm.errors import JournalError
+from rosrm.journal import recovery
 from rosrm.journal.recovery import recover
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.model.records import Intent, Record
@@ -152,6 +154,60 @@ def test_killed_at_any_step_the_journal_is_the_damaged_one_or_the_new_one(
     kept = [one.read_bytes() for one in path.parent.glob("journal.sqlite.damaged-*")]
     assert kept
     assert all(one == damaged for one in kept)
+
+
+@pytest.mark.parametrize("step", range(6))
+@pytest.mark.parametrize("kind", [Killed, OSError])
+def test_an_interrupted_recovery_keeps_the_write_ahead_log(path, monkeypatch, step, kind) -> None:
+    """A damaged journal may still have one, with the newest rows."""
+    log = path.with_name("journal.sqlite-wal")
+    with contextlib.closing(SqliteJournal(path)) as journal:
+        journal.write([], [Intent("process", "newest", {"instances": {}})], 0.0)
+        files = {one: one.read_bytes() for one in (path, log)}  # as a SIGKILL leaves them
+    for one, content in files.items():
+        one.write_bytes(content)
+    monkeypatch.setattr(recovery, "_check_damaged", lambda _: None)
+    steps = iter(range(100))
+
+    def dying(act):
+        def call(*args, **options):
+            if any(str(path) in str(one) for one in args) and next(steps) == step:
+                raise kind
+            return act(*args, **options)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for name in ("link", "rename", "replace", "unlink"):
+            patch.setattr(os, name, dying(getattr(os, name)))
+        with contextlib.suppress(Killed, JournalError):
+            recover(path, wall=lambda: 1700.0)
+    if path.read_bytes() == files[path]:
+        assert kind is Killed or log.read_bytes() == files[log]
+        recover(path, wall=lambda: 1800.0)
+    with contextlib.closing(SqliteJournal(path)) as journal:
+        assert "newest" in journal.intents("process")
+        assert len(journal.intents("process")) == COUNT + 1
+
+
+def test_a_shortage_is_no_damage(path, monkeypatch) -> None:
+    """Rows that cannot be read for lack of room are not lost: the recovery can be repeated."""
+    spoil(path, "intent", 1)
+    damaged = path.read_bytes()
+
+    def lacks_room(self, *_: object):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(
+        recovery,
+        "_read_events",
+        lambda database, found: list(
+            recovery._rows(mock.Mock(execute=lacks_room), found, "SELECT")
+        ),
+    )
+    with pytest.raises(JournalError, match=r"not recovered and is unchanged.*full"):
+        recover(path)
+    assert path.read_bytes() == damaged
 
 
 def test_all_hosts_must_report_before_work_is_assigned(path, recovered) -> None:
