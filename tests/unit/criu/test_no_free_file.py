@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import builtins
+import contextlib
 import errno
 import io
 import os
+import resource
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,9 +17,29 @@ from pathlib import Path
 
 import pytest
 
-from rosrm_criu.engine import image, paths, process_tree, restore_result, shim
+from rosrm_criu.control import client
+from rosrm_criu.control.messages import (
+    SIGNAL,
+    VARIABLE,
+    Request,
+    State,
+    Status,
+    Want,
+    read_message,
+    write_message,
+)
+from rosrm_criu.engine import (
+    external_resources,
+    image,
+    open_files,
+    paths,
+    process_tree,
+    restore_result,
+    shim,
+    udp_ports,
+)
 from rosrm_criu.engine.restore_result import Outcome
-from rosrm_criu.executors import artifacts, checkpoint
+from rosrm_criu.executors import artifacts, checkpoint, move, periodic
 
 RESTORED = Outcome(pid=7, inner_pid=7)
 
@@ -41,7 +65,8 @@ def fails(monkeypatch):
                 raise OSError(number, os.strerror(number), str(path))
             return really(file, *rest, **named)
 
-        monkeypatch.setattr(io, "open", opening)
+        for module in (io, builtins):
+            monkeypatch.setattr(module, "open", opening)
 
     return fail
 
@@ -135,3 +160,82 @@ def test_a_sweep_keeps_a_result_that_it_cannot_look_at(result, fails, tmp_path, 
     fails(result.parent / name)
     artifacts.forget_restored(tmp_path, [])
     assert restore_result.was_restored(result.parent)
+
+
+# --- a node that is out of the ROS graph ----------------------------------------------------------
+
+
+@pytest.fixture
+def away(tmp_path: Path) -> Iterator[tuple[int, Path]]:
+    """Yield pid and control directory of a node that has left the ROS graph."""
+    control = tmp_path / "control"
+    control.mkdir(mode=0o700)
+    write_message(control, Status(State.LEFT, "t"))
+    program = f"import signal; signal.signal({SIGNAL}, lambda *_: None); print(flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        env={**os.environ, VARIABLE: str(control)},
+    ) as node:  # fmt: skip
+        assert node.stdout is not None
+        assert node.stdout.readline()
+        yield node.pid, control
+        node.kill()
+
+
+@pytest.mark.parametrize("name", ["status", "environ"])
+def test_an_unexamined_node_is_not_left_out_of_the_graph(away, fails, tmp_path, name):
+    """The undo of a move fails, so that it is repeated, and the note of the departure stays."""
+    pid, control = away
+    asked = {
+        "here": {
+            "host": "a", "state": str(tmp_path), "pids": {"x#1": pid}, "instances": ["x#1"],
+            "options": {},
+        },
+        "process": "x", "source": 1, "destination": 2, "attempt": "t", "timeout": 0.1,
+    }  # fmt: skip
+    note = paths.periodic(tmp_path, 1) / "away"
+    note.parent.mkdir(parents=True)
+    note.write_text("t")
+    for undo in (lambda: move.go_on(asked), lambda: periodic.call_back_all(tmp_path, {"x#1": pid})):
+        fails(Path(f"/proc/{pid}/{name}"))
+        with pytest.raises(OSError, match="Too many open files"):
+            undo()
+        assert note.exists()
+    periodic.call_back_all(tmp_path, {"x#1": pid})
+    assert read_message(control, Request) == Request("t", Want.JOIN)
+    assert not note.exists()
+
+
+# --- what a process has open ----------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def no_free_descriptor() -> Iterator[None]:
+    """Let no file be opened in this context."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (3, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+@pytest.mark.parametrize(
+    "look",
+    [
+        lambda pid: list(open_files.descriptors([pid])),
+        lambda pid: external_resources.outward([pid]),
+        external_resources.tracer,
+        lambda pid: external_resources.shared_memory([pid]),
+        lambda _: external_resources._unix_peers(),
+        lambda pid: udp_ports.bound([pid]),
+        lambda pid: list(udp_ports._table(pid, "udp", socket.AF_INET)),
+        lambda _: udp_ports.reserve([udp_ports.Port(socket.AF_INET, "127.0.0.1", 0)]),
+        lambda _: udp_ports.read(Path(__file__)),
+        process_tree.is_gone,
+        lambda pid: process_tree.memory_of([pid]),
+    ],
+)
+def test_a_look_without_a_descriptor_does_not_say_nothing(sleeper, look):
+    with no_free_descriptor(), pytest.raises(OSError, match="Too many open files"):
+        look(sleeper.pid)

@@ -131,7 +131,7 @@ def make_directory(directory: Path, uid: int | None = None) -> None:
     except OSError as error:
         raise PortableError(
             f"the control directory {directory} cannot be made: {reason_of(error)}"
-        ) from None
+        ) from error
     remove_messages(directory)  # requests follow only after the node has written a status
 
 
@@ -221,13 +221,17 @@ def _ask(directory: Path, pid: int | None, request: Request) -> None:
     try:
         write_message(directory, request)
     except OSError as error:
-        raise PortableError(f"{directory} cannot be written: {reason_of(error)}") from None
+        raise PortableError(f"{directory} cannot be written: {reason_of(error)}") from error
     if pid is not None and (why := send(pid, SIGNAL)):
         raise PortableError(f"process {pid} cannot be signalled: {why}")
 
 
 def listens(pid: int) -> bool:
-    """Return True if a process handles the request signal; an ended process does not."""
+    """Return True if a process handles the request signal; an ended process does not.
+
+    Raises:
+        OSError: no look is possible now.
+    """
     try:
         _check_catches(pid)
     except PortableError:
@@ -250,10 +254,15 @@ def _check_catches(pid: int) -> None:
 
 
 def _of_process(pid: int) -> dict[str, str]:
-    """Return the lines of /proc/PID/status; raise `PortableError` if the process has ended."""
+    """Return the lines of /proc/PID/status.
+
+    Raises:
+        PortableError: the process has ended.
+        OSError: no look is possible now.
+    """
     try:
         lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8", errors="replace")
-    except OSError:
+    except (FileNotFoundError, ProcessLookupError):
         raise PortableError(f"process {pid} has ended") from None
     found = dict(line.split(":\t", 1) for line in lines.splitlines() if ":\t" in line)
     if found.get("State", "")[:1] in "ZX":

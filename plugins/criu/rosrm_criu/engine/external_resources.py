@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor.procfs import everyone
 from rosrm_criu.engine.open_files import Descriptor, descriptors
 
@@ -59,7 +60,8 @@ def tracer(pid: int) -> int:
     """Return the pid of the process that traces this one by ptrace, e.g. a debugger; 0: none."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines()
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return 0
     return next((int(line.split()[1]) for line in lines if line.startswith("TracerPid:")), 0)
 
@@ -72,7 +74,8 @@ def shared_memory(pids: Iterable[int]) -> str:
     for pid in pids:
         try:
             maps = Path(f"/proc/{pid}/maps").read_text(errors="replace")
-        except OSError:  # the process has ended
+        except OSError as error:  # the process has ended
+            raise_shortage(error)
             continue
         found = next((line for line in maps.splitlines() if _OF_FAST_DDS in line), "")
         if found:
@@ -131,7 +134,8 @@ def _unix_peers() -> Mapping[int, int]:
             kernel.sendto(header + request, (0, 0))
             while _read_peers(kernel.recv(1 << 17), peers):
                 pass
-    except OSError:  # a kernel without sock_diag, on which CRIU cannot dump any socket
+    except OSError as error:  # a kernel without sock_diag, on which CRIU cannot dump any socket
+        raise_shortage(error)
         return {}
     return peers
 

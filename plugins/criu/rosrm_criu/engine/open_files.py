@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from rosrm.shortage import raise_shortage
 from rosrm_criu.engine.image import COPIES, HeldFile, MappedFile
 
 #: Bytes of the largest file that follows the process.
@@ -41,13 +42,18 @@ class Descriptor(NamedTuple):
 
 
 def descriptors(pids: Iterable[int]) -> Iterator[Descriptor]:
-    """Yield all open files of some processes, including standard output and error."""
+    """Yield all open files of some processes, including standard output and error.
+
+    Raises:
+        OSError: no look is possible now.
+    """
     for pid in pids:
         for number in _numbers(pid):
             try:
                 target = os.readlink(f"/proc/{pid}/fd/{number}")  # noqa: PTH115 - may be no path
                 flags = _flags(pid, number)
-            except OSError:  # closed since the listing
+            except OSError as error:  # closed since the listing
+                raise_shortage(error)
                 continue
             yield Descriptor(pid, number, target, flags)
 
@@ -55,7 +61,8 @@ def descriptors(pids: Iterable[int]) -> Iterator[Descriptor]:
 def _numbers(pid: int) -> list[int]:
     try:
         return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))  # noqa: PTH208
-    except OSError:  # the process has ended, or belongs to another user
+    except OSError as error:  # the process has ended, or belongs to another user
+        raise_shortage(error)
         return []
 
 
@@ -140,7 +147,8 @@ def _is_regular(pid: int, path: str) -> bool:
         return False
     try:
         return stat.S_ISREG(_status(pid, path).st_mode)
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return False
 
 

@@ -110,7 +110,8 @@ def is_gone(pid: int) -> bool:
     """
     try:
         threads = sum(1 for _ in Path(f"/proc/{pid}/task").iterdir())
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return True
     return threads <= 1 and not is_alive(pid)
 
@@ -144,7 +145,7 @@ def memory_of(pids: Iterable[int]) -> int:
     """Return the least bytes that an image of processes needs: memory that no file backs."""
     total = 0
     for pid in pids:
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):
             for line in Path(f"/proc/{pid}/status").read_text(errors="replace").splitlines():
                 if line.startswith(("RssAnon:", "RssShmem:", "VmSwap:")):
                     total += int(line.split()[1]) * 1024

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from rosrm.shortage import raise_shortage
 from rosrm_criu.engine.open_files import descriptors
 
 _TABLES: Final = (("udp", socket.AF_INET), ("udp6", socket.AF_INET6))
@@ -49,7 +50,8 @@ def _table(pid: int, name: str, family: int) -> Iterator[tuple[str, Port]]:
     """Yield each socket in the network of a process, by the name that its descriptors show."""
     try:
         lines = Path(f"/proc/{pid}/net/{name}").read_text().splitlines()[1:]
-    except OSError:  # the process has ended, or the kernel has no IPv6
+    except OSError as error:  # the process has ended, or the kernel has no IPv6
+        raise_shortage(error)
         return
     for line in lines:
         words = line.split()
@@ -69,20 +71,29 @@ def write(path: Path, ports: Iterable[Port]) -> None:
 
 
 def read(path: Path) -> list[Port]:
-    """Return the ports in a file; none if it cannot be read."""
-    with contextlib.suppress(OSError, ValueError, TypeError):
+    """Return the ports in a file; none if it is missing or damaged."""
+    try:
         return [Port(*one) for one in json.loads(path.read_text(encoding="utf-8"))]
-    return []
+    except (OSError, ValueError, TypeError) as error:
+        if isinstance(error, OSError):
+            raise_shortage(error)
+        return []
 
 
 def reserve(ports: Iterable[Port]) -> list[socket.socket]:
-    """Return sockets that reserve these ports until they are closed; none for a port in use."""
-    held = []
-    for one in ports:
-        try:
-            held.append(_reserved(one))
-        except OSError:  # shared, or taken since the dump: the restore will report it
-            continue
+    """Return sockets that reserve these ports until they are closed; none for a port in use.
+
+    Raises:
+        OSError: no socket can be opened now; none stays open.
+    """
+    with contextlib.ExitStack() as undo:
+        held = []
+        for one in ports:
+            try:
+                held.append(undo.enter_context(_reserved(one)))
+            except OSError as error:  # shared, or taken since: the restore will report it
+                raise_shortage(error)
+        undo.pop_all()
     return held
 
 

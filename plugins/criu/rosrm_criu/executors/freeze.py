@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 from rosrm.errors import CriuError
+from rosrm.shortage import exists, raise_shortage, status
 from rosrm.wording import reason_of
 from rosrm_criu.control.client import (
     ask_prepare,
@@ -55,12 +56,13 @@ def call_back(pid: int, control: Path, attempt: str) -> bool:
 
     Raises:
         PortableError: the request cannot be written, e.g. because the disk is full.
+        OSError: the process cannot be examined now.
     """
     dump.resume(pid)
     root = process_tree.root_of(pid)
     if not listens(root):
         return False
-    if not control.exists():  # where hosts share /tmp, a copy of the node that ended has removed it
+    if not exists(control):  # where hosts share /tmp, a copy of the node that ended has removed it
         make_directory(control, owner_of(pid))
     ask_resume(control, root, attempt)
     return True
@@ -73,10 +75,16 @@ def has_failed(control: Path) -> bool:
 
 
 def control_of(pid: int) -> Path:
-    """Return the control directory of the node, fixed at its start and unchanged by migrations."""
+    """Return the control directory of the node, fixed at its start and unchanged by migrations.
+
+    Raises:
+        CriuError: the process was not started to be moved, or has ended.
+        OSError: no look is possible now.
+    """
     try:
         found = directory_of(process_tree.root_of(pid))
     except OSError as error:
+        raise_shortage(error)
         raise CriuError(f"process {pid} cannot be examined: {reason_of(error)}") from None
     if found is None:
         raise CriuError(
@@ -92,7 +100,7 @@ def control_of(pid: int) -> Path:
 
 def owner_of(pid: int) -> int:
     """Return the uid of the process; raise `CriuError` if it has ended."""
-    try:
-        return Path(f"/proc/{process_tree.root_of(pid)}").stat().st_uid
-    except OSError:
-        raise CriuError(f"process {pid} has ended") from None
+    found = status(f"/proc/{process_tree.root_of(pid)}")
+    if found is None:
+        raise CriuError(f"process {pid} has ended")
+    return found.st_uid
