@@ -34,8 +34,10 @@ from rosrm_criu.engine import (
     open_files,
     paths,
     process_tree,
+    restart_from_image,
     restore_result,
     shim,
+    slots,
     udp_ports,
 )
 from rosrm_criu.engine.restore_result import Outcome
@@ -239,3 +241,51 @@ def no_free_descriptor() -> Iterator[None]:
 def test_a_look_without_a_descriptor_does_not_say_nothing(sleeper, look):
     with no_free_descriptor(), pytest.raises(OSError, match="Too many open files"):
         look(sleeper.pid)
+
+
+# --- the start from a periodic image --------------------------------------------------------------
+
+
+@pytest.fixture
+def slot(tmp_path: Path) -> Path:
+    """Return a valid periodic image."""
+    found = paths.periodic(tmp_path, 1) / "1"
+    found.mkdir(parents=True)
+    slots.complete(found, slots.Rejoin(str(tmp_path / "control"), "t", os.geteuid()))
+    return found
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EMFILE])
+@pytest.mark.parametrize("name", ["rejoin.json", "starts"])
+def test_a_start_without_room_does_not_forgo_the_memory(
+    slot, fails, monkeypatch, capsys, number, name
+):
+    """The restart policy tries again; the process does not start without its memory."""
+    words = restart_from_image.command(
+        sys.executable, slot.parent, ["false"], criu=Path("/none"), timeout=5.0
+    )
+    monkeypatch.setattr(sys, "argv", ["restart_from_image.py", *words[5:]])
+    became = []
+    monkeypatch.setattr(restart_from_image, "become", became.append)
+    fails(slot / name, number=number)
+    with pytest.raises(SystemExit, match=f"not started: .*{os.strerror(number)}"):
+        restart_from_image.main()
+    assert not became
+    restart_from_image.main()
+    assert any(word.endswith("shim.py") for word in became[0])
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EMFILE])
+def test_a_request_to_rejoin_without_room_does_not_forgo_the_memory(slot, monkeypatch, number):
+    def refused(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(client, "write_message", refused)
+    words = restart_from_image.command(
+        sys.executable, slot.parent, ["false"], criu=Path("/none"), timeout=5.0
+    )
+    monkeypatch.setattr(sys, "argv", ["restart_from_image.py", *words[5:]])
+    monkeypatch.setattr(restart_from_image, "become", lambda _: pytest.fail("it was started"))
+    for _ in range(3):  # more often than an image is started from
+        with pytest.raises(SystemExit, match=f"not started: .*{os.strerror(number)}"):
+            restart_from_image.main()

@@ -2,7 +2,8 @@
 
 The supervisor runs this program instead of the process's own command line, at the first start and
 after each crash. The program becomes the shim or the process, so a restart needs neither slave nor
-master. If an image cannot be used, the log says so and the process starts without it.
+master. If an image cannot be used, the log says so and the process starts without it. For want of
+disk space, memory or a descriptor the start fails instead, and the restart policy repeats it.
 
 Standard library only. It runs as `python -I -S restart_from_image.py FOLDER DIRECTORY -- COMMAND`
 (see `command`; FOLDER contains `rosrm`), and imports little, because it runs at each start.
@@ -10,6 +11,7 @@ Standard library only. It runs as `python -I -S restart_from_image.py FOLDER DIR
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -21,6 +23,7 @@ if not __package__:
     sys.path += [str(Path(__file__).resolve().parents[2]), sys.argv.pop(1)]
 
 from rosrm.errors import CriuError, PortableError
+from rosrm.shortage import SHORTAGE
 from rosrm.wording import reason_of
 from rosrm_criu.engine import paths, slots
 
@@ -31,6 +34,9 @@ if TYPE_CHECKING:
 
 #: Signals that Python handles or ignores by default; ignored ones would stay ignored after execve.
 _CHANGED: Final = (signal.SIGPIPE, signal.SIGXFSZ, signal.SIGINT)
+
+#: Errors that say nothing about an image.
+_PASSING: Final = frozenset({errno.ENOSPC, errno.EDQUOT}) | SHORTAGE
 
 
 def command(
@@ -58,7 +64,10 @@ def main() -> NoReturn:
         found = slots.newest(Path(options.directory))
         if found is not None:
             _restore(*found, options)
-    except (CriuError, PortableError) as error:
+    except (CriuError, PortableError, OSError) as error:
+        cause = error.__cause__ or error
+        if isinstance(cause, OSError) and cause.errno in _PASSING:
+            sys.exit(f"not started: its periodic image cannot be used now: {error}")
         sys.stderr.write(f"not started from its periodic image, but without it: {error}\n")
         sys.stderr.flush()
     become(then)
@@ -85,6 +94,7 @@ def _restore(image: Path, rejoin: Rejoin, options: argparse.Namespace) -> NoRetu
     make_directory(control, rejoin.uid)
     ask_resume(control, None, rejoin.request)
     (image / restore_result.FILE).unlink(missing_ok=True)  # of an earlier start
+    slots.count_start(image)  # last, because a start that fails before it says nothing about it
     sys.stderr.write(f"starts from its periodic image {image}\n")
     sys.stderr.flush()
     become(

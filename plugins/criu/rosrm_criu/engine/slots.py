@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm.wording import reason_of
+from rosrm.shortage import status
 
 _REJOIN: Final = "rejoin.json"
 _STARTS: Final = "starts"
@@ -73,10 +72,11 @@ def start_without_image(parent: Path) -> None:
 
 
 def newest(parent: Path) -> tuple[Path, Rejoin] | None:
-    """Return the image to start from, and count this start; None: start without an image.
+    """Return the image to start from; None: start without an image.
 
     Raises:
-        CriuError: an image cannot be read, or its start cannot be counted.
+        CriuError: an image is damaged.
+        OSError: no look at an image is possible now.
     """
     if (parent / _IGNORE_IMAGES).exists():
         shutil.rmtree(parent, ignore_errors=True)
@@ -86,21 +86,17 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
             rejoin = Rejoin(**json.loads((slot / _REJOIN).read_text(encoding="utf-8")))
         except FileNotFoundError:
             continue  # the dump is under way, or was interrupted
-        except (OSError, ValueError, TypeError) as error:
+        except (ValueError, TypeError) as error:
             raise CriuError(f"the periodic image {slot} is damaged: {_REJOIN}: {error}") from None
-        return (slot, rejoin) if _count_start(slot) <= _MOST_STARTS else None
+        counted = status(slot / _STARTS)
+        return None if counted and counted.st_size >= _MOST_STARTS else (slot, rejoin)
     return None
 
 
-def _count_start(slot: Path) -> int:
-    """Append one byte per start, which cannot be half written; return the number of starts."""
-    try:
-        with (slot / _STARTS).open("ab") as file:
-            file.write(b".")
-            file.flush()
-            return os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise CriuError(f"the periodic image {slot} cannot be used: {reason_of(error)}") from None
+def count_start(slot: Path) -> None:
+    """Append one byte per start, which cannot be half written; raise OSError on a full disk."""
+    with (slot / _STARTS).open("ab") as file:
+        file.write(b".")
 
 
 def _slots(parent: Path) -> list[Path]:
