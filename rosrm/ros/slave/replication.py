@@ -25,8 +25,6 @@ _log = logging.getLogger("rosrm.slave")
 _IDLE: Final = 60.0
 #: Time-out of a request for a ticket, and time until the next request, in seconds.
 _ASK_AGAIN: Final = 1.0
-#: Reason why a slave has not executed a request.
-_RESTARTED: Final = "its slave has restarted"
 #: Most bytes of one part.
 MOST: Final = 256 << 10
 
@@ -36,11 +34,12 @@ class NotStored(NamedTuple):
 
     Attributes:
         code: "newer": it has this snapshot or a newer one; "order": the parts before are missing;
-            "full": no room; "damaged": the digest differs; "timeout": no answer, or it restarted.
+            "full": no room; "damaged": the digest differs; "timeout": no answer; "stale": the slave
+            has restarted, or keys have changed, so that the next request needs another ticket.
         message: as text for the user.
     """
 
-    code: Literal["newer", "order", "full", "damaged", "timeout", "version", "denied"]
+    code: Literal["newer", "order", "full", "damaged", "timeout", "stale", "version", "denied"]
     message: str
 
 
@@ -49,9 +48,12 @@ class NotSent(NamedTuple):
 
     Attributes:
         message: as text for the user.
+        is_stale: the slave has restarted, or keys have changed, so that the same request needs
+            another ticket.
     """
 
     message: str
+    is_stale: bool = False
 
 
 class ReplicationHost(Protocol):
@@ -214,10 +216,9 @@ class ReplicationEndpoint:
         def answered(response: srv.StoreReplica.Response | None) -> None:
             if response is None:
                 done(NotStored("timeout", f"no answer within {timeout:g} s"))
-            elif self._has_restarted(service, response):
-                done(NotStored("timeout", _RESTARTED))
             else:
                 answer = response.answer
+                self._forget_ticket(service, answer)
                 done(None if answer.accepted else NotStored(answer.code, answer.message))
 
         service = _Service(srv.StoreReplica, names.STORE_REPLICA, host, part.process)
@@ -240,21 +241,18 @@ class ReplicationEndpoint:
         def answered(response: srv.ReadSnapshot.Response | None) -> None:
             if response is None:
                 done(NotSent(f"no answer within {timeout:g} s"))
-            elif self._has_restarted(service, response):
-                done(NotSent(_RESTARTED))
             else:
+                self._forget_ticket(service, response.answer)
                 done(_part_of(response, wanted))
 
         service = _Service(srv.ReadSnapshot, names.READ_SNAPSHOT, host, wanted.process)
         client = self._found(service, now)
         self._client.call(client, request, now + timeout, answered)
 
-    def _has_restarted(self, service: _Service, response: Any) -> bool:
-        """Return True if the slave has restarted; the next use then requests a new ticket."""
-        is_stale = bool(response.answer.code == "stale")
-        if is_stale and service in self._clients:
+    def _forget_ticket(self, service: _Service, answer: Any) -> None:
+        """Let the next use request a new ticket, if a slave has refused the one of a request."""
+        if answer.code == "stale" and service in self._clients:
             self._clients[service].introduction = None
-        return is_stale
 
     def expire(self, now: float) -> None:
         """End requests without an answer in time, and destroy idle clients."""
@@ -268,7 +266,7 @@ class ReplicationEndpoint:
 def _part_of(response: srv.ReadSnapshot.Response, wanted: TransferPart) -> TransferPart | NotSent:
     answer = response.answer
     if not answer.accepted:
-        return NotSent(str(answer.message))
+        return NotSent(str(answer.message), is_stale=answer.code == "stale")
     return TransferPart(
         wanted.process, response.number, response.sequence, wanted.offset, response.total,
         response.digest, bytes(response.data),

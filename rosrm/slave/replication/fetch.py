@@ -77,7 +77,9 @@ class Fetch:
         if self._has_ended:
             return
         now = clocks.boot_time()
-        if isinstance(part, NotSent):
+        if isinstance(part, NotSent) and part.is_stale:
+            self._waits, self._host_by = False, now + PATIENCE
+        elif isinstance(part, NotSent):
             self._next_host(part.message, now)
         elif part.number < self._assignment.snapshots_from or not part.data:
             self._next_host("its snapshot is of an earlier process of that name", now)

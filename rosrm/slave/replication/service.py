@@ -47,7 +47,7 @@ _OF_A_LACK: Final = SHORTAGE | {errno.ENOSPC, errno.EDQUOT}
 #: Most parts from other hosts that wait for the thread.
 _MOST_WAITING: Final = 64
 #: Codes of failures of the network alone.
-_TRANSIENT: Final = frozenset({"timeout", "order"})
+_TRANSIENT: Final = frozenset({"timeout", "order", "stale"})
 
 
 #: Answer for a part that could not be written because of an unexpected error.
@@ -61,7 +61,8 @@ class _Shipment:
     Attributes:
         sent: age of the newest snapshot that each host accepted.
         due: monotonic time of the next transfer to each host, seconds.
-        refusals: code with which each host refused the last snapshot.
+        refusals: code with which each host refused the last snapshot; "": "stale" for the first
+            time.
     """
 
     instance: InstanceId
@@ -331,7 +332,11 @@ class ReplicationService:
             shipment.due[host] = now
         else:
             shipment.due[host] = now + max(_AGAIN, shipment.every)
-        if shipment.refusals.get(host) != refusal.code:
+        if refusal.code == "stale" and host not in shipment.refusals:
+            shipment.refusals[host] = (
+                ""  # the next transfer has another ticket, so nothing is wrong
+            )
+        elif shipment.refusals.get(host) != refusal.code:
             shipment.refusals[host] = refusal.code
             instance, why = shipment.instance, refusal.message
             _log.info("%s does not keep the state of %s: %s", host, instance, why)

@@ -46,6 +46,8 @@ class Wire:
         self.given.append(part)
         if host in self.net.silent:
             self.net.unanswered.append(lambda: done(NotStored("timeout", "no answer")))
+        elif self.net.takes_stale(host):
+            done(NotStored("stale", "keys have changed"))
         else:
             self.net.slaves[host].take_part(part, done)
 
@@ -53,6 +55,9 @@ class Wire:
         def answer(part: TransferPart | None) -> None:
             done(NotSent("there is no such snapshot here") if part is None else part)
 
+        if self.net.takes_stale(host):
+            done(NotSent("keys have changed", is_stale=True))
+            return
         age = (request.number, request.sequence)
         self.net.slaves[host].read_part(request.process, age, request.offset, 1000, answer)
 
@@ -68,6 +73,7 @@ class Net:
     Attributes:
         hidden: hosts that discovery does not find.
         silent: hosts that do not answer.
+        stale: host to the number of requests for which it wants another ticket.
         reports: reports to the master, by host.
     """
 
@@ -78,6 +84,7 @@ class Net:
         self.wires: dict[str, Wire] = {}
         self.hidden: set[str] = set()
         self.silent: set[str] = set()
+        self.stale: dict[str, int] = {}
         self.unanswered: list[Callable[[], None]] = []
         self.reports: dict[str, list] = {}
         self.now = clocks.boot_time()
@@ -99,6 +106,10 @@ class Net:
     def add_all(self, names: str) -> None:
         for name in names:
             self.add(name)
+
+    def takes_stale(self, host: str) -> bool:
+        self.stale[host] = self.stale.get(host, 0) - 1
+        return self.stale[host] >= 0
 
     def replicate(self, *to: str, period: float = 1.0) -> None:
         """Add these hosts, and a, which sends replicas of `p` to them."""
@@ -216,6 +227,18 @@ def test_a_silent_host_is_tried_again_and_logged_once(net):
     assert net.log.messages == ["b does not keep the state of p#7: no answer"]
     net.silent.clear()
     net.until(lambda: net.age("b") == (7, 1), "the copy on b")
+
+
+@pytest.mark.parametrize(
+    ("requests", "logged"), [(1, []), (3, ["b does not keep the state of p#7: keys have changed"])]
+)
+def test_a_changed_key_delays_a_replica_without_a_warning(net, requests, logged):
+    """Each new or revoked key ends all tickets, and the next transfer has another one."""
+    net.replicate("b")
+    net.stale["b"] = requests
+    net.write("a", 1)
+    net.until(lambda: net.age("b") == (7, 1), "the copy on b")
+    assert net.log.messages == logged
 
 
 def test_a_newer_snapshot_on_the_other_host_is_left_alone(net):
@@ -394,6 +417,16 @@ def test_a_start_fetches_the_newest_snapshot(net):
     assert prepare(net, "a", request) == [request]
     assert net.age("a") == (7, 42)
     assert "was fetched from b for p#9" in net.log.messages[0]
+
+
+def test_a_changed_key_makes_no_start_take_an_older_snapshot(net):
+    """The same host is asked again, with another ticket."""
+    net.add_all("abc")
+    net.write("b", 42)
+    net.write("c", 41)
+    net.stale["b"] = 2
+    prepare(net, "a", assignment("b", "c"))
+    assert net.age("a") == (7, 42)
 
 
 def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
