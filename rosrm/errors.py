@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from itertools import takewhile
 from traceback import walk_stack, walk_tb
 from types import FrameType
@@ -32,6 +33,35 @@ class ConfigError(RosrmError):
     """A file or an option is invalid; none of its values were used."""
 
     exit_code = 2
+
+
+@contextmanager
+def ros_needed() -> Iterator[None]:
+    """Turn a failed import of ROS 2 into an error for the user.
+
+    Raises:
+        RosrmError: ROS 2 cannot be imported.
+    """
+    try:
+        yield
+    except ImportError as error:
+        if not _is_of_ros(error):
+            raise
+        reason = str(error).splitlines()[0]
+        raise RosrmError(
+            f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
+            "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
+        ) from None
+
+
+def _is_of_ros(error: ImportError) -> bool:
+    """Return True if a package of ROS was not found, or could not be loaded by `rosrm.ros`."""
+    package = (error.name or "").partition(".")[0]
+    modules = (frame.f_globals.get("__name__", "") for frame, _ in walk_tb(error.__traceback__))
+    return package != "rosrm" and (
+        package in {"rclpy", "rosrm_msgs"}
+        or any(f"{one}.".startswith("rosrm.ros.") for one in modules)
+    )
 
 
 class PluginError(RosrmError):

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from rosrm.errors import Refused, RosrmError
+from rosrm.errors import Refused, ros_needed
 from rosrm.model.ros_settings import RosSettings
 from rosrm.wording import no_such
 
@@ -84,22 +84,13 @@ def connect(
         RosrmError: ROS 2 cannot be imported.
     """
     name = f"{getpass.getuser()}@{socket.gethostname()}:{os.getpid()}"
-    try:
-        # The first import of ROS.
-        from rosrm.ros.master_connection import MasterClient  # noqa: PLC0415
+    with ros_needed():
+        from rosrm.ros.master_connection import MasterClient  # noqa: PLC0415 - the first of ROS
 
         return MasterClient.connect(
             settings, name=name, timeout=timeout, security=security or security_mode(),
             joined=joined, begun=begun,
         )  # fmt: skip
-    except ImportError as error:
-        if (error.name or "").split(".")[0] == "rosrm":
-            raise
-        reason = str(error).splitlines()[0]
-        raise RosrmError(
-            f"ROS 2 cannot be imported ({reason}). Source your ROS 2 (and the workspace with "
-            "rosrm_msgs), or install the wheels: pip install 'rosrm[ros]'"
-        ) from None
 
 
 def row_of(kind: str, name: str, rows: Mapping[str, Row]) -> Row:

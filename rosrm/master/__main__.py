@@ -16,12 +16,14 @@ gc.disable()  # a fifth of the start's CPU time; see `bootstrap.end_start`
 import os
 
 from rosrm.config.settings import ClusterConfig
-from rosrm.ros.own_signals import own_signals
-from rosrm.ros.participant import Participant
-from rosrm.ros.peer_announcements import request_announcements
-from rosrm.runtime.bootstrap import Handover, run
+from rosrm.runtime.bootstrap import Handover, ros_imported, run
 from rosrm.runtime.crash_notes import kept_notes
 from rosrm.runtime.process_end import end_process
+
+with ros_imported("master"):
+    from rosrm.ros.own_signals import own_signals
+    from rosrm.ros.participant import Participant
+    from rosrm.ros.peer_announcements import request_announcements
 
 
 def serve(handover: Handover) -> int:

@@ -17,7 +17,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 from rosrm import clocks
-from rosrm.errors import NoMaster, Refused
+from rosrm.errors import NoMaster, Refused, ros_needed
 from rosrm.keys.finding import user_security
 from rosrm.keys.roles import SecurityMode
 from rosrm.keys.security import Member
@@ -292,7 +292,8 @@ class MasterClient:
     def _endpoints(self) -> SealedEndpoints[Member]:
         """Endpoints over DDS, created on first use, because that imports rclpy."""
         if self._made_endpoints is None:
-            from rosrm.ros.participant import Participant  # noqa: PLC0415 - see above
+            with ros_needed():
+                from rosrm.ros.participant import Participant  # noqa: PLC0415 - see above
 
             self._joined = self._joined or Participant(self._settings, names.client_node())
             self._made_endpoints = SealedEndpoints(self._joined, self._security)

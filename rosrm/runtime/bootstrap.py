@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
-from rosrm.errors import ConfigError, RosrmError
+from rosrm.errors import ConfigError, RosrmError, ros_needed
 from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.runtime import private_files
 from rosrm.runtime.dispositions import handle
@@ -192,5 +192,20 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
             end_with_parent(handover.parent)
         return serve(handover)
     except RosrmError as error:
-        sys.stderr.write(printable(f"rosrm {role}: {error}\n"))
-        return error.exit_code
+        return _report(role, error)
+
+
+@contextlib.contextmanager
+def ros_imported(role: str) -> Iterator[None]:
+    """Return a context for the imports of a role that need ROS 2; exit if it cannot be imported."""
+    try:
+        with ros_needed():
+            yield
+    except RosrmError as error:
+        sys.exit(_report(role, error))
+
+
+def _report(role: str, error: RosrmError) -> int:
+    """Print an error, and return the exit code."""
+    sys.stderr.write(printable(f"rosrm {role}: {error}\n"))
+    return error.exit_code

@@ -17,13 +17,15 @@ import logging
 
 from rosrm.config.settings import HostConfig
 from rosrm.extensions.registry import SLAVE_KINDS, Registry
-from rosrm.ros.own_signals import own_signals
 from rosrm.runtime import cgroups, oom_score
-from rosrm.runtime.bootstrap import Handover, run
+from rosrm.runtime.bootstrap import Handover, ros_imported, run
 from rosrm.runtime.crash_notes import kept_notes
 from rosrm.runtime.process_end import end_process
 from rosrm.slave.own_key import wait_for_security
-from rosrm.slave.runtime import SlaveRuntime
+
+with ros_imported("slave"):
+    from rosrm.ros.own_signals import own_signals
+    from rosrm.slave.runtime import SlaveRuntime
 
 _log = logging.getLogger("rosrm.slave")
 

@@ -14,7 +14,7 @@ import typer
 
 from rosrm.cli.output.legible import legible
 from rosrm.cli.process import INTERRUPTED
-from rosrm.errors import RosrmError
+from rosrm.errors import RosrmError, ros_needed
 
 
 def echo(text: str, *, err: bool = False) -> None:
@@ -26,7 +26,8 @@ def echo(text: str, *, err: bool = False) -> None:
 def errors_reported() -> Iterator[None]:
     """Turn an error of rosrm, and Ctrl-C, into a message and the exit code of the process."""
     try:
-        yield
+        with ros_needed():
+            yield
     except RosrmError as error:
         echo(f"rosrm: {error}", err=True)
         sys.exit(error.exit_code)

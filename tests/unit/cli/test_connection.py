@@ -16,7 +16,8 @@ from typer.main import get_command
 from rosrm import clocks
 from rosrm.cli import connection, early
 from rosrm.cli.command_tree import app
-from rosrm.errors import NoMaster, RosrmError
+from rosrm.errors import NoMaster, RosrmError, ros_needed
+from rosrm.keys.roles import Principal
 from rosrm.keys.security import NoSecurity
 from rosrm.model.ros_settings import RosSettings
 from rosrm.ros import master_connection
@@ -196,6 +197,45 @@ def test_without_ros_a_command_says_how_to_get_it(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", no_ros)
     with pytest.raises(RosrmError, match=r"ROS 2 cannot be imported.*pip install 'rosrm\[ros\]'"):
         connection.connect(RosSettings())
+
+
+@pytest.mark.parametrize("words", [("master",), ("slave",), ("up",), ("run", "--", "id"), ("ps",)])
+def test_ros_that_cannot_be_loaded_is_an_error_without_a_traceback(tmp_path, words):
+    """A wrong LD_LIBRARY_PATH, for example; also where a command needs ROS only later."""
+    (tmp_path / "rclpy").mkdir()
+    text = 'raise ImportError("librcl.so: cannot open shared object file", name="_rclpy")'
+    (tmp_path / "rclpy" / "__init__.py").write_text(text, encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, "-m", "rosrm.cli", *words], capture_output=True, text=True, timeout=60,
+        env=os.environ | {"PYTHONPATH": str(tmp_path), "ROSRM_KEYS": str(tmp_path / "keys"),
+                          "ROSRM_SECURITY": "none"}, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    last = done.stderr.splitlines()[-1]
+    assert re.match(r"rosrm[ a-z]*: ROS 2 cannot be imported \(librcl\.so: cannot open", last)
+    assert "Traceback" not in done.stderr
+
+
+def test_an_endpoint_that_is_made_later_names_ros_too(monkeypatch):
+    """A client on the master's machine joins ROS only for the logs of a slave."""
+    real = builtins.__import__
+
+    def no_ros(name, *more):
+        if name == "rosrm.ros.participant":
+            raise ImportError("librcl.so: cannot open shared object file")
+        return real(name, *more)
+
+    security = NoSecurity(Principal("user", "ada"))
+    client = master_connection.MasterClient(RosSettings(), security, "test", 1.0, None)
+    monkeypatch.setattr(builtins, "__import__", no_ros)
+    with pytest.raises(RosrmError, match=r"ROS 2 cannot be imported \(librcl"):
+        _ = client._endpoints
+
+
+def test_another_import_that_fails_is_no_fault_of_ros():
+    """Its traceback leads to the cause."""
+    with pytest.raises(ImportError, match="no aiohttp"), ros_needed():
+        raise ImportError("no aiohttp", name="aiohttp")
 
 
 @pytest.mark.parametrize("word", ["abc", "300", "-1", "1.5"])
