@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
 from rosrm.errors import ConfigError
 
@@ -110,39 +110,56 @@ _BEARERS: Final = frozenset({Role.BEARER})
 #: Roles that key files can have.
 GRANTED: Final = (Role.VIEWER, Role.SUBMITTER, Role.OPERATOR, Role.HOST)
 
-#: The roles that may send a request, by the name of its service. All other roles are refused.
-ALLOWED: Final[Mapping[str, frozenset[Role]]] = {
-    "handshake": _READERS | _HOSTS,
-    "introduce": _SUBMITTERS | _HOSTS,
-    "list": _READERS,
-    "explain": _READERS,
-    "submit": _SUBMITTERS,
-    "apply": _SUBMITTERS,
-    "load_modes": _OPERATORS,
-    "switch_mode": _OPERATORS,
-    "cancel": _SUBMITTERS,
-    "restart": _SUBMITTERS,
-    "migrate": _SUBMITTERS,
-    "checkpoint": _SUBMITTERS,
-    "restore": _SUBMITTERS,
-    "kill": _OPERATORS,
-    "prune": _OPERATORS,
-    "rebalance": _OPERATORS,
-    "reload": _OPERATORS,
-    "set_host_state": _OPERATORS,
-    "register_host": _HOSTS,
-    "leave": _HOSTS,
-    "request_process": _HOSTS,
-    "store_artifact": _SUBMITTERS,
-    "read_artifact": _HOSTS,
+
+class Permission(NamedTuple):
+    """The roles that may send a request.
+
+    Attributes:
+        action: the effect of the request, for a refusal: "submit processes".
+    """
+
+    roles: frozenset[Role]
+    action: str
+
+
+#: The permission of each request, by the name of its service. All other requests are refused.
+ALLOWED: Final[Mapping[str, Permission]] = {
+    "handshake": Permission(_READERS | _HOSTS, "connect to the master"),
+    "introduce": Permission(_SUBMITTERS | _HOSTS, "read logs"),
+    "list": Permission(_READERS, "list hosts and processes"),
+    "explain": Permission(_READERS, "ask for explanations"),
+    "submit": Permission(_SUBMITTERS, "submit processes"),
+    "apply": Permission(_SUBMITTERS, "change applications"),
+    "load_modes": Permission(_OPERATORS, "load modes"),
+    "switch_mode": Permission(_OPERATORS, "switch the mode"),
+    "cancel": Permission(_SUBMITTERS, "cancel processes"),
+    "restart": Permission(_SUBMITTERS, "restart processes"),
+    "migrate": Permission(_SUBMITTERS, "migrate processes"),
+    "checkpoint": Permission(_SUBMITTERS, "checkpoint processes"),
+    "restore": Permission(_SUBMITTERS, "restore processes"),
+    "kill": Permission(_OPERATORS, "kill processes"),
+    "prune": Permission(_OPERATORS, "remove hosts and processes from the listing"),
+    "rebalance": Permission(_OPERATORS, "rebalance the hosts"),
+    "reload": Permission(_OPERATORS, "reload the settings"),
+    "set_host_state": Permission(_OPERATORS, "cordon, uncordon or drain hosts"),
+    "register_host": Permission(_HOSTS, "register a host"),
+    "leave": Permission(_HOSTS, "end the registration of a host"),
+    "request_process": Permission(_HOSTS, "request work for a host"),
+    "store_artifact": Permission(_SUBMITTERS, "send artifacts"),
+    "read_artifact": Permission(_HOSTS, "read artifacts"),
     # Services of slaves:
-    "control": _MASTERS,
-    "read_log": _BEARERS,
-    "store_replica": _BEARERS,
-    "read_snapshot": _BEARERS,
+    "control": Permission(_MASTERS, "control a slave"),
+    "read_log": Permission(_BEARERS, "read logs"),
+    "store_replica": Permission(_BEARERS, "store replicas of snapshots"),
+    "read_snapshot": Permission(_BEARERS, "read snapshots"),
 }
 
 
 def may_send(role: Role, request: str) -> bool:
     """Return True if a role may send a request, given by the name of its service."""
-    return role in ALLOWED.get(request, frozenset())
+    return request in ALLOWED and role in ALLOWED[request].roles
+
+
+def action_of(request: str) -> str:
+    """Return the effect of a request as a verb with its object."""
+    return ALLOWED[request].action if request in ALLOWED else f"send {request!r}"

@@ -17,7 +17,7 @@ from weakref import WeakKeyDictionary
 
 from rosrm.errors import Refused
 from rosrm.keys.links import SealedMessage
-from rosrm.keys.roles import may_send
+from rosrm.keys.roles import action_of, may_send
 from rosrm.keys.sealing import FORMAT, RUN_BYTES, channel_of
 from rosrm.keys.security import SIGNATURE_BYTES, Peer, Security
 from rosrm.keys.tickets import Ticket
@@ -373,8 +373,8 @@ def _denial(peer: Peer, service: str) -> str:
     if may_send(role, service):
         return ""
     return (
-        f"{peer.grant.principal} has the role {role.value}, which may not send {service!r}; ask an "
-        f"operator"
+        f"{peer.grant.principal} has the role {role.value}, which may not {action_of(service)}; "
+        f"ask an operator"
     )
 
 

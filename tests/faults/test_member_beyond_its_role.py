@@ -9,7 +9,7 @@ import pytest
 
 from rosrm.keys import key_files
 from rosrm.keys.cluster import own_grant
-from rosrm.keys.roles import Role, principal_of
+from rosrm.keys.roles import Role, action_of, principal_of
 from rosrm.keys.security import MemberSecurity
 from rosrm.keys.tickets import ticket_of
 from rosrm.ros import names, qos
@@ -75,7 +75,8 @@ def test_a_viewer_only_reads(scene, member) -> None:
     for name, answers in denied.items():
         for code, message in answers:
             assert code == "denied"
-            assert f"user:vera has the role viewer, which may not send {name!r}" in message
+            what = f"user:vera has the role viewer, which may not {action_of(name)}"
+            assert message.startswith(what)
             assert "operator" in message
     requests = dict(scene.requests())
     for name in READS:

@@ -12,7 +12,7 @@ from rosrm import clocks
 from rosrm.errors import Refused
 from rosrm.keys.cluster import ClusterSecret, own_grant
 from rosrm.keys.links import SealedMessage
-from rosrm.keys.roles import Principal
+from rosrm.keys.roles import Grant, Principal, Role
 from rosrm.keys.sealing import RUN_BYTES
 from rosrm.keys.security import SIGNATURE_BYTES, Member, MemberSecurity, NoSecurity, Peer
 from rosrm.keys.tickets import Ticket
@@ -21,6 +21,7 @@ from rosrm.ros.callback_guard import CallbackGuard
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import (
     SealedEndpoints,
+    _denial,
     answer_channel,
     envelope_from_msg,
     envelope_to_msg,
@@ -253,3 +254,14 @@ def test_a_recorded_beat_of_a_former_run_is_not_believed() -> None:
     follower.beat(2, 50)
     follower.beat(1, 7)  # recorded, and correctly signed
     assert follower.taken == [50]
+
+
+def test_a_refusal_says_what_the_role_may_not_do():
+    """The name of the service would say nothing to the user of `rosrm logs` or `drain`."""
+    viewer = SimpleNamespace(ticket=None, grant=Grant(Principal("user", "vera"), Role.VIEWER, 1))
+    for service, action in (
+        ("introduce", "read logs"), ("set_host_state", "cordon, uncordon or drain hosts"),
+    ):  # fmt: skip
+        assert _denial(viewer, service) == (
+            f"user:vera has the role viewer, which may not {action}; ask an operator"
+        )
