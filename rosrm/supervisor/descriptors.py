@@ -6,9 +6,7 @@ fail with descriptors above 1023, so processes get the limit that the supervisor
 
 from __future__ import annotations
 
-import contextlib
 import resource
-from collections.abc import Iterator
 from typing import Final
 
 #: Descriptors that no watched process takes: for /proc, logs, the record and connections.
@@ -27,13 +25,10 @@ def most_watched() -> int:
     return resource.getrlimit(resource.RLIMIT_NOFILE)[0] - RESERVE
 
 
-@contextlib.contextmanager
-def limited(soft: int | None) -> Iterator[None]:
-    """Give processes that are started in this context a soft limit; None: that of this process."""
-    former = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft is not None:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, former[1]), former[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, former)
+def lower_limit(soft: int) -> None:
+    """Give this process, which becomes a program, a soft limit: never the supervisor itself.
+
+    The supervisor may have more open files than that, and could open no other one.
+    """
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, hard), hard))

@@ -30,7 +30,6 @@ from rosrm.runtime.oom_score import score_of_children
 from rosrm.runtime.signalling import send
 from rosrm.supervisor import (
     adoption,
-    descriptors,
     endpoint,
     lease_file,
     messages,
@@ -369,7 +368,7 @@ class Server:
             return
 
         def begin(group: int, scheduler: spawn.Scheduler | None) -> spawn.Attempt:
-            with score_of_children(), descriptors.limited(self._files):
+            with score_of_children():
                 return spawn.begin(program, self._null, log, group=group, scheduler=scheduler)
 
         assert launch is not None
@@ -503,7 +502,7 @@ class Server:
         environment = start_trace.stamped_in(self._environment(launch), recorded=recorded)
         directory = launch.directory or paths.work_directory(self._state)
         return spawn.Program(
-            launch.argv, environment, directory, launch.secrets, launch.limits.nice
+            launch.argv, environment, directory, launch.secrets, launch.limits.nice, self._files
         )
 
     def _environment(self, launch: messages.Launch) -> dict[str, str]:

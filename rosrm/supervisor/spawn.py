@@ -17,7 +17,11 @@ from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, NoReturn
 
 from rosrm.shortage import SHORTAGE
-from rosrm.supervisor import exec_failures, secret_files  # a child may be unable to load them
+from rosrm.supervisor import (  # a child may be unable to load them
+    descriptors,
+    exec_failures,
+    secret_files,
+)
 from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError, is_transient
 from rosrm.wording import reason_of
 
@@ -44,6 +48,7 @@ class Program(NamedTuple):
         directory: working directory.
         secrets: variable to the path of the file with its value.
         nice: niceness; 0: that of this process. Without the right to it, that of this process.
+        files: soft limit of open descriptors; None: that of this process.
     """
 
     argv: tuple[str, ...]
@@ -51,6 +56,7 @@ class Program(NamedTuple):
     directory: str
     secrets: Mapping[str, str] = {}
     nice: int = 0
+    files: int | None = None
 
 
 class Attempt:
@@ -175,6 +181,8 @@ def _become(
         told = _REPORT
         # A child that waits for a path must not hold the lock and the socket of its supervisor.
         os.closerange(_REPORT + 1, resource.getrlimit(resource.RLIMIT_NOFILE)[1])
+        if program.files is not None:
+            descriptors.lower_limit(program.files)
         _execute(program, tell, scheduler, parent)
     except SpawnError as error:
         kind = _NO_SCHEDULE if isinstance(error, ScheduleRefused) else _FAULT

@@ -433,15 +433,22 @@ def test_the_supervisor_is_small(client):
 def test_the_supervisor_may_open_more_files_than_its_processes(host):
     """Each taken-over process needs a descriptor, but programs with `select` fail above 1023."""
     former, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = min(700, hard)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+    soft = 64
+    resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
     try:
         client = host.connect()
-        pid = host.sleeper(client, "p")
+        client.start([host.order(f"p{number}", "sleep", "1000") for number in range(soft)])
+        up: set[str] = set()
+        wait_until(
+            lambda: up.update(one.instance.process for one in client.receive(1.0) if one.pid)
+            or len(up) == soft, "all processes", seen=lambda: up,
+        )  # fmt: skip
+        client = host.replace_supervisor(client)
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, (former, hard))
     assert resource.prlimit(client.pid, resource.RLIMIT_NOFILE) == (hard, hard)
-    assert resource.prlimit(pid, resource.RLIMIT_NOFILE) == (wanted, hard)
+    pid = host.sleeper(client, "later")
+    assert resource.prlimit(pid, resource.RLIMIT_NOFILE) == (soft, hard)
 
 
 def test_more_processes_than_descriptors_are_taken_over(host):
