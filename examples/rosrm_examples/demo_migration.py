@@ -130,7 +130,8 @@ def _demonstrate(options: argparse.Namespace, stage: Stage) -> None:
     stage.console.print(_closing(summary, out), highlight=False, soft_wrap=True)
     wrong = differences(summary, live.state, migrations=1)
     if wrong:
-        raise DemoFailed(f"{'; '.join(wrong)}; see the logs in {out / CLUSTER}")
+        why = record.last_problem()
+        raise DemoFailed(f"{'; '.join(wrong)}{why}; see the logs in {out / CLUSTER}")
 
 
 def _check_memory() -> None:

@@ -14,6 +14,8 @@ from rosrm import EventRow, Listing, ProcessRow
 
 SAMPLES_FILE: Final = "samples.json"
 EVENTS_FILE: Final = "events.jsonl"
+#: Kinds of events on failed migrations and versions.
+_PROBLEMS: Final = ("stayed", "migration_stuck", "application_failed")
 
 #: States in which a process has ended.
 ENDED: Final = ("finished", "failed", "cancelled")
@@ -83,6 +85,11 @@ class Record:
     def of_kind(self, *kinds: str) -> Iterator[EventRow]:
         """Return the events of some kinds."""
         return (event for event in self.events if event.kind in kinds)
+
+    def last_problem(self) -> str:
+        """Return why a migration or version failed last, as a clause to append; "" for none."""
+        found = [event.message for event in self.of_kind(*_PROBLEMS)]
+        return f"; the last problem: {found[-1]}" if found else ""
 
     def moves(self) -> list[Move]:
         """Return every migration that reached its destination."""

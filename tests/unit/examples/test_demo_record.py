@@ -177,3 +177,18 @@ def test_the_note_tells_the_act():
     assert "full" in note_of(view(process("holder_01", "queued")))
     assert "recorder" in note_of(view(process("recorder", "running")))
     assert note_of(view()) == ""
+
+
+def test_a_failed_demo_names_the_last_problem():
+    """A wrong number of handoffs alone would not say why one is missing."""
+    record = Record((), {}, 0)
+    assert record.last_problem() == ""
+    for number, (kind, message) in enumerate((
+        ("stayed", "slam stays on robot: it took longer than 10 s"),
+        ("application_failed", "mapping is degraded: slam: switching took longer than 10 s"),
+        ("migrated", "slam moved"),
+    )):  # fmt: skip
+        record.events.append(EventRow(number, 1e9, 0.0, kind, "slam", "robot", message))
+    assert record.last_problem() == (
+        "; the last problem: mapping is degraded: slam: switching took longer than 10 s"
+    )
