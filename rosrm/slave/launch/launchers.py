@@ -26,6 +26,7 @@ from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import MadeLauncher
 from rosrm.extensions.plugin_calls import PluginCalls, given, implements, required, titled
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
+from rosrm.supervisor.procfs import read_stat
 
 T = TypeVar("T")
 L = TypeVar("L")
@@ -39,6 +40,8 @@ ASK_LIMIT: Final = 0.5
 #: Maximum number of processes of an instance, and the highest pid of a kernel.
 MOST_MEMBERS: Final = 32_768
 _HIGHEST_PID: Final = 1 << 22
+#: Ticks in a second, in which the kernel gives the start of a process.
+_TICKS: Final = float(os.sysconf("SC_CLK_TCK"))
 #: Maximum bytes of a command line with its environment: half of what a kernel accepts by default.
 #: As JSON they are shorter than the longest line that a supervisor accepts.
 MOST_BYTES: Final = 1 << 20
@@ -55,8 +58,7 @@ class Launchers:
     Attributes:
         made: by name.
         unusable: name to the reason, of those that are absent or broken here.
-        awaited: names of those that are still being created. They may lead or have started any
-            instance, so a question about one has no answer.
+        awaited: names of those that are still being created.
         broken: name to the reason, of those that could not be created.
         capabilities_of: names the launcher of a process; raises `PluginError` if that is unknown.
         calls: guard and record of the calls.
@@ -68,6 +70,7 @@ class Launchers:
     calls: PluginCalls = field(default_factory=PluginCalls)
     awaited: frozenset[str] = frozenset()
     broken: dict[str, str] = field(init=False, default_factory=dict)
+    _began: float = field(init=False, default_factory=clocks.boot_time)
     _since: dict[str, float] = field(init=False, default_factory=dict)
     _locks: dict[str, threading.Lock] = field(init=False, default_factory=dict)
 
@@ -192,15 +195,15 @@ class Launchers:
             self._ask(name, "has_departed", launcher, None, bool, leader)
             for name, launcher in self._of(GraphDepartureLauncher)
         }
-        unknown = self.awaited or None in answers
+        unknown = None in answers or self._may_lack_launcher_of(leader)
         return True if True in answers else (None if unknown else False)
 
     def members(self, leader: int) -> Sequence[int] | None:
         """Return all processes of an instance that a launcher's program leads, the leader first.
 
-        (): no launcher's program leads it. None: a launcher cannot tell, or may lead it soon.
+        (): no launcher's program leads it. None: a launcher cannot tell, or may not be created.
         """
-        known = not self.awaited
+        known = not self._may_lack_launcher_of(leader)
         for name, launcher in self._of(ProcessTreeLauncher):
             leads = self._leads(name, launcher, leader)
             if leads:
@@ -218,6 +221,18 @@ class Launchers:
     def _leads(self, name: str, launcher: ProcessTreeLauncher, leader: int) -> bool | None:
         # A launcher that fails may lead the session, so it is asked again.
         return self._ask(name, "leads", launcher, None, bool | None, leader)
+
+    def _may_lack_launcher_of(self, leader: int) -> bool:
+        """Return True if a launcher that is not created may have started an instance.
+
+        Only a former run of the slave may have started the instance by it.
+        """
+        if not self.failing:
+            return False
+        with contextlib.suppress(OSError):  # no room for a look
+            stat = read_stat(leader)
+            return stat is None or stat.start / _TICKS < self._began
+        return True
 
     def _of(self, contract: Callable[..., L]) -> Iterator[tuple[str, L]]:
         for name, one in self.made.items():

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import subprocess
 import threading
+import time
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -194,14 +199,38 @@ def test_questions_to_a_launcher_that_is_not_created_have_no_answer() -> None:
     ("outcome", "said", "broken"),
     [(SkipPlugin("no CRIU"), "absent: no CRIU", False), (OSError("no"), "broken: ", True)],
 )
-def test_a_launcher_that_fails_late_is_no_launcher(outcome, said, broken) -> None:
-    """Questions have answers again, because no instance can be of it."""
-    slow = Gate(outcome)
-    one = creation(LauncherOffer("ours", slow))
+@pytest.mark.parametrize("is_late", [True, False])
+def test_a_broken_launcher_may_have_started_what_a_former_run_of_the_slave_left(
+    outcome, said, broken, is_late
+) -> None:
+    """Its node may be out of the ROS graph; an absent launcher has started none."""
+    gate = Gate(outcome)
+    one = creation(LauncherOffer("ours", gate))
     launchers = one._launchers
-    wait(one)
-    slow.is_open.set()
-    take_late(one)
+    if is_late:
+        wait(one)
+        with sleeping() as since:
+            assert (launchers.has_departed(since), launchers.members(since)) == (False, ())
+        gate.is_open.set()
+        take_late(one)
+    else:
+        gate.is_open.set()
+        wait(one)
     assert launchers.unusable["ours"].startswith(said)
     assert ("ours" in launchers.broken) is broken
-    assert (launchers.has_departed(10), launchers.members(10)) == (False, ())
+    former = os.getpid()
+    unknown = (None, None) if broken else (False, ())
+    assert (launchers.has_departed(former), launchers.members(former)) == unknown
+    with sleeping() as since:
+        assert (launchers.has_departed(since), launchers.members(since)) == (False, ())
+
+
+@contextlib.contextmanager
+def sleeping() -> Iterator[int]:
+    """Return the pid of a process that starts now."""
+    time.sleep(0.02)  # the kernel gives the start of a process in ticks of 0.01 s
+    with subprocess.Popen(["sleep", "60"]) as process:
+        try:
+            yield process.pid
+        finally:
+            process.kill()
