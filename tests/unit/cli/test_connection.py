@@ -208,7 +208,7 @@ def test_ros_that_cannot_be_loaded_is_an_error_without_a_traceback(tmp_path, wor
     done = subprocess.run(
         [sys.executable, "-m", "rosrm.cli", *words], capture_output=True, text=True, timeout=60,
         env=os.environ | {"PYTHONPATH": str(tmp_path), "ROSRM_KEYS": str(tmp_path / "keys"),
-                          "ROSRM_SECURITY": "none"}, check=False,
+                          "XDG_STATE_HOME": str(tmp_path), "ROSRM_SECURITY": "none"}, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     last = done.stderr.splitlines()[-1]

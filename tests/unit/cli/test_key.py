@@ -22,6 +22,7 @@ def home(tmp_path, monkeypatch):
     for variable in ("ROSRM_KEY", "ROSRM_SECURITY"):
         monkeypatch.delenv(variable, raising=False)
     monkeypatch.setenv("ROSRM_KEYS", str(tmp_path / "keys"))
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))  # it may have a host's name
     monkeypatch.setattr("socket.gethostname", lambda: "desk")
     return tmp_path / "keys"
 
