@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rosrm import ConfigError
+from rosrm.shortage import raise_shortage
 
 
 @dataclass(frozen=True)
@@ -80,10 +81,16 @@ def find_group(
 
 
 def read_number(path: Path) -> float | None:
-    """Return the number in a control file; None: no file, or no limit ("max" or -1)."""
+    """Return the number in a control file; None: no file, or no limit ("max" or -1).
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         word = path.read_text().split()[0]
-    except (OSError, IndexError):
+    except (OSError, IndexError) as error:
+        if isinstance(error, OSError):
+            raise_shortage(error)
         return None
     if word in ("max", "-1"):
         return None
@@ -126,10 +133,15 @@ def _mounts(root: Path, pid: str) -> list[_Mount]:
 
 
 def lines_of(file: Path) -> list[str]:
-    """Return the lines of a file of /proc, whose paths may have any bytes; []: it is not there."""
+    """Return the lines of a file of /proc, whose paths may have any bytes; []: it is not there.
+
+    Raises:
+        OSError: the system has no room for a look.
+    """
     try:
         return os.fsdecode(file.read_bytes()).split("\n")[:-1]
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return []
 
 

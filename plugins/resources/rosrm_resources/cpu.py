@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm import PositiveSeconds, ProbeContext, Sessions
+from rosrm.shortage import raise_shortage
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
@@ -249,7 +250,8 @@ def _cpu_set(group: Group, root: Path) -> tuple[Path, float] | None:
     for directory in sets.upward():
         try:
             size = count_cpus((directory / name).read_text())
-        except OSError:  # the controller is not enabled for this group, so the group above counts
+        except OSError as error:  # the controller is not enabled here, so the group above counts
+            raise_shortage(error)
             continue
         if own and size != own:  # the set above contains this one, so another size is another set
             break

@@ -35,6 +35,7 @@ from rosrm_criu.engine import (
     paths,
     process_tree,
     restart_from_image,
+    restore,
     restore_result,
     shim,
     slots,
@@ -236,6 +237,7 @@ def no_free_descriptor() -> Iterator[None]:
         lambda _: udp_ports.read(Path(__file__)),
         process_tree.is_gone,
         lambda pid: process_tree.memory_of([pid]),
+        lambda pid: restore.replace_marks(pid, {}),
     ],
 )
 def test_a_look_without_a_descriptor_does_not_say_nothing(sleeper, look):

@@ -5,7 +5,6 @@ This module runs only in the shim (`rosrm_criu.engine.shim`).
 
 from __future__ import annotations
 
-import contextlib
 import os
 import platform
 import stat
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor import paths
 from rosrm.supervisor.procfs import SUPERVISOR_MARK
 from rosrm.wording import reason_of
@@ -155,8 +155,11 @@ def replace_marks(pid: int, marks: Mapping[str, str]) -> None:
     Args:
         pid: the process.
         marks: new values by name; "" empties a variable.
+
+    Raises:
+        OSError: the system has no room for a look, so the process still has its former marks.
     """
-    with contextlib.suppress(OSError, ValueError):
+    try:
         fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
         start, end = int(fields[47]), int(fields[48])
         descriptor = os.open(f"/proc/{pid}/mem", os.O_RDWR | os.O_CLOEXEC)
@@ -166,6 +169,9 @@ def replace_marks(pid: int, marks: Mapping[str, str]) -> None:
                 _overwrite(descriptor, start, block, name.encode(), os.fsencode(value))
         finally:
             os.close(descriptor)
+    except (OSError, ValueError) as error:  # it has ended, or its environment is of its own form
+        if isinstance(error, OSError):
+            raise_shortage(error)
 
 
 def _overwrite(memory: int, start: int, block: bytes, name: bytes, value: bytes) -> None:

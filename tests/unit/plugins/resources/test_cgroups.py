@@ -1,5 +1,7 @@
 """Control groups of a process, and the limits that they set."""
 
+import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -7,7 +9,7 @@ import pytest
 
 from rosrm.errors import ConfigError
 from rosrm.testing import FakeClock
-from rosrm_resources.cgroups import count_cpus, find_group, read_number
+from rosrm_resources.cgroups import count_cpus, find_group, lines_of, read_number
 from rosrm_resources.cpu import CgroupCpu, CpuOptions
 from rosrm_resources.memory import CgroupMemory, MemoryOptions
 
@@ -270,3 +272,16 @@ def test_a_group_goes_with_no_other_scope(options):
         options(scope="slice", group="/a")
     with pytest.raises(ValueError, match="does not begin with '/'"):
         options(group="a")
+
+
+def test_a_limit_that_cannot_be_read_now_is_not_absent(monkeypatch):
+    """Otherwise a host without a free descriptor offers what its control group lacks."""
+
+    def refused(*_, **__):
+        raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    for read in ("read_text", "read_bytes"):
+        monkeypatch.setattr(Path, read, refused)
+    for look in (read_number, lines_of):
+        with pytest.raises(OSError, match="Too many open files"):
+            look(TREES / "docker/proc/self/cgroup")
