@@ -221,6 +221,19 @@ _NEW_FIELDS: Final = frozenset(
 )
 
 
+def _environment(identity: str, variables: Mapping[str, str]) -> dict[str, Any]:
+    return {"record": "environment", "id": identity, "variables": dict(variables)}
+
+
+def _launch(launch: Launch) -> dict[str, Any]:
+    return {"record": "order", **messages.launch_fields(launch)}
+
+
+def _state(instance: Instance, birth: int, kills: int) -> dict[str, Any]:
+    fields = {name: getattr(instance, name) for name in Instance.__slots__}
+    return {"record": "state", "birth": birth, "oom_kills": kills, **fields}
+
+
 class _Outcome(NamedTuple):
     """Outcome of a write: what is still to be written, and why; "": it succeeded."""
 
@@ -242,6 +255,7 @@ class InstanceRecord:
     def __init__(self, state: str, disk: FileThread) -> None:
         self.trouble = ""
         self._path = os.path.join(state, paths.RECORD)
+        self._boot = procfs.boot_id()
         self._disk = disk
         self._waiting: list[bytes] = []
         self._waiting_bytes = 0
@@ -257,11 +271,11 @@ class InstanceRecord:
 
     def environment(self, identity: str, variables: Mapping[str, str]) -> None:
         """Add a base environment that launches refer to."""
-        self._add({"record": "environment", "id": identity, "variables": dict(variables)})
+        self._add(_environment(identity, variables))
 
     def launch(self, launch: Launch) -> None:
         """Add an order to start."""
-        self._add({"record": "order", **messages.launch_fields(launch)})
+        self._add(_launch(launch))
 
     def spawning(self, keys: Iterable[Key]) -> None:
         """Add the spawns that will be tried next."""
@@ -269,8 +283,7 @@ class InstanceRecord:
 
     def state(self, instance: Instance, birth: int, kills: int = 0) -> None:
         """Add the whole state of an instance; `birth` and `kills`: see `Recorded`."""
-        fields = {name: getattr(instance, name) for name in Instance.__slots__}
-        self._add({"record": "state", "birth": birth, "oom_kills": kills, **fields})
+        self._add(_state(instance, birth, kills))
 
     def dead(self, key: Key, number: int) -> None:
         """Add a forgotten instance; its process starts no number up to `number` any more."""
@@ -304,25 +317,25 @@ class InstanceRecord:
         launches refer to now or may later; one may be missing, where a line was damaged.
         """
         is_free = self._settle() and self._waiting_bytes < self._compact_waiting_at
-        waiting = self._take_waiting()
-        self._add({"record": "header", "version": VERSION, "boot": procfs.boot_id()})
-        for process, number in core_state.dead.items():
-            self._add(
+        lines = [
+            {"record": "header", "version": VERSION, "boot": self._boot},
+            *(
                 {"record": "dead", "key": [process, -1], "process": process, "number": number}
-            )
-        for identity, variables in environments.items():
-            self.environment(identity, variables)
-        for launch in launches.values():
-            self.launch(launch)
-        for instance in core_state.instances.values():
-            self.state(instance, birth(instance.key), kills(instance.key))
+                for process, number in core_state.dead.items()
+            ),
+            *(_environment(*one) for one in environments.items()),
+            *map(_launch, launches.values()),
+            *(_state(one, birth(key), kills(key)) for key, one in core_state.instances.items()),
+        ]
+        text = b"".join(map(json_lines.line, lines))
+        waiting = self._take_waiting()  # only now: a failure before loses no line
         if is_free:
-            text = self._take_waiting()
             # Without a header of this boot, what runs would count as ended with the machine.
             left = waiting if self._has_header else text
             self._begin(partial(self._replace, text, left), is_whole=not self._has_header)
         else:
             self._is_whole = True
+            self._waiting, self._waiting_bytes = [text], len(text)
             self._compact_waiting_at = max(COMPACT_BYTES, COMPACT_FACTOR * self._waiting_bytes)
 
     def _take_waiting(self) -> bytes:

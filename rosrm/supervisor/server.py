@@ -170,9 +170,9 @@ class Server:
         for look in (self._logs.look, self._trees.look, self._groups.look, self._abandon_late):
             _guarded(look, now)
         _guarded(self._spawn_some)
-        self._remove_groups()
+        _guarded(self._remove_groups)
         if self._record.is_large():
-            self._rewrite_record()
+            _guarded(self._rewrite_record)
         self._record.flush()
         self._report()
         _guarded(self._prepare_held)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import json
 import os
@@ -18,6 +19,7 @@ from rosrm.supervisor import instance_record as rc
 from rosrm.supervisor import takeover
 from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.messages import Amend, Launch
+from tests.limits import no_more_files
 from tests.waiting import PATIENCE, wait_until
 
 DISK = FileThread("the state directory", patience=PATIENCE)
@@ -342,4 +344,20 @@ def test_no_fault_of_a_write_loses_a_line(tmp_path, core, record, monkeypatch, f
         assert not record.flush()
     assert type(fault).__name__ in record.trouble
     assert record.flush()
+    assert rc.read(str(tmp_path)).births == {TALKER: 77}
+
+
+@pytest.mark.parametrize("fault", [None, OSError(errno.EMFILE, "Too many open files")])
+def test_a_compaction_without_descriptors_loses_no_line(tmp_path, core, record, fault):
+    """A compaction opens no file before it writes, and one that fails leaves the waiting lines."""
+    record.state(core.instances[TALKER], 77)
+
+    def birth(_: object) -> int:
+        if fault:
+            raise fault
+        return 77
+
+    with no_more_files(), contextlib.suppress(OSError):
+        record.rewrite(core, {}, {}, birth)
+    wait_until(record.flush, "the record is written")
     assert rc.read(str(tmp_path)).births == {TALKER: 77}
