@@ -15,6 +15,7 @@ from rosrm.extensions.answers import exact, exact_fields
 from rosrm.extensions.contracts import Executor, Launcher, Probe, ProbeOffer
 from rosrm.extensions.guard import guarded
 from rosrm.model.description_checks import resource_fault
+from rosrm.model.devices import Device
 from rosrm.model.rows import PluginKind
 from rosrm.model.values import (
     EMPTY,
@@ -163,6 +164,10 @@ class FailedProbe:
 
     def read(self) -> Iterable[Reading]:
         """Raise `PluginError` with the reason."""
+        raise PluginError(self.reason)
+
+    def devices(self) -> Iterable[Device]:
+        """Raise as `read` does, because the probe may find devices."""
         raise PluginError(self.reason)
 
     def close(self) -> None:

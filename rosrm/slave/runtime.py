@@ -174,7 +174,9 @@ class SlaveRuntime:
             self._paths = PathCalls("paths of users", self._post)
             self._device_faults = FileFaults(self._paths.run, self._look_at_devices)
             self._devices = DeviceWatch(config.devices)
-            self._devices.look(self._sampler.devices, self._device_faults)
+            self._devices.look(
+                self._sampler.devices, self._sampler.awaits_devices, self._device_faults
+            )
             self._textfile = Textfile(config.textfile, config.host)
             opened.callback(self._textfile.remove)
             graph = self._join_ros(opened)
@@ -440,7 +442,8 @@ class SlaveRuntime:
 
     def _look_at_devices(self) -> None:
         """Report changes of the devices to the master, and lost ones to the core."""
-        if self._devices.look(self._sampler.devices, self._device_faults):
+        sampler = self._sampler
+        if self._devices.look(sampler.devices, sampler.awaits_devices, self._device_faults):
             self._endpoint.set_devices(self._devices.devices)
         if self._devices.lost:
             self._take(DevicesMissed(self._devices.lost))

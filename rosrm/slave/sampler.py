@@ -110,6 +110,7 @@ class _Outcome(NamedTuple):
         reason: of a failure; "" otherwise.
         seconds: duration of the read.
         age: seconds since the read was queued, which can be much longer on a busy machine.
+        began: when the read began.
     """
 
     values: tuple[float, ...]
@@ -118,6 +119,14 @@ class _Outcome(NamedTuple):
     reason: str
     seconds: float
     age: float
+    began: float
+
+
+class Finding(NamedTuple):
+    """Devices that a probe found, and when that read began."""
+
+    devices: tuple[Device, ...]
+    at: float
 
 
 class Sampler:
@@ -140,7 +149,7 @@ class Sampler:
         self._watched: list[_Watched] = []
         self._usage = [0.0] * RESOURCE_SLOTS
         self._by_process: dict[int, Mapping[int, float]] = {}
-        self._devices: dict[str, tuple[Device, ...]] = {}
+        self._devices: dict[str, Finding] = {}
         self.rearrange(probes)
 
     def rearrange(self, probes: Sequence[MadeProbe]) -> tuple[MadeProbe, ...]:
@@ -187,9 +196,14 @@ class Sampler:
         return self._by_process
 
     @property
-    def devices(self) -> Mapping[str, tuple[Device, ...]]:
+    def devices(self) -> Mapping[str, Finding]:
         """Return the name of each probe to the devices that it found last."""
         return self._devices
+
+    @property
+    def awaits_devices(self) -> bool:
+        """Return True if a probe may find devices, but has not answered which."""
+        return any(one.name not in self._devices for one in self._watched)
 
     def latest(self, now: float) -> Sample:
         """Return the newest readings, and queue a read of each probe that is due. Never waits."""
@@ -258,7 +272,7 @@ class Sampler:
         """Store the values of a finished read, and choose the thread of the next read."""
         watched.outcome, watched.measured = None, True
         if outcome.devices is not None:
-            self._devices[watched.name] = outcome.devices
+            self._devices[watched.name] = Finding(outcome.devices, outcome.began)
         if outcome.values:
             self._usage[watched.slots] = outcome.values
             for name, amounts in outcome.by_process.items():
@@ -439,7 +453,13 @@ class _Watched:
             values, by_process = (), EMPTY
         ended = self._clock()
         self.outcome = _Outcome(
-            values, by_process, devices, reason or fault, ended - started, ended - self.asked
+            values,
+            by_process,
+            devices,
+            reason or fault,
+            ended - started,
+            ended - self.asked,
+            started,
         )
         self.busy = False
         if not self._progress.is_set():  # `set` takes as long as a quick read

@@ -5,7 +5,9 @@ from __future__ import annotations
 import errno
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
@@ -13,41 +15,106 @@ import yaml
 from rosrm import threads
 from rosrm.core.slave.watches import Memo
 from rosrm.errors import LaunchError, describe_fault
+from rosrm.extensions.made import FailedProbe
 from rosrm.model.devices import Device, DeviceNeed, HeldDevice
 from rosrm.model.values import EMPTY, Assignment, InstanceId, ProcessSpec
-from rosrm.runtime.path_calls import NoAnswer, PathCalls, run_at_once
+from rosrm.runtime.path_calls import NoAnswer, PathCall, PathCalls, run_at_once
 from rosrm.slave.devices import DeviceWatch, FileFaults
 from rosrm.slave.launch.command import order_of, plain_launch
 from rosrm.slave.launch.environment import ProcessLocation
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.memos import from_memo, to_memo
-from rosrm.slave.sampler import Sampler
+from rosrm.slave.sampler import Finding, Sampler
 from rosrm.testing import FakeClock, FakeProbe, made_probe
 from tests.waiting import PATIENCE
 
 GPU = Device("gpu", "0", about="a model")
 
 
-def looked(watch: DeviceWatch, found=EMPTY) -> bool:
-    """Look at the devices and their files once."""
-    return watch.look(found, FileFaults(run_at_once, lambda: None))
+def looked(watch: DeviceWatch, found=EMPTY, at: float = 0.0, awaits: bool = False) -> bool:
+    """Look at the devices and their files once; the probes have found theirs at that time, too."""
+    findings = {name: Finding(devices, at) for name, devices in found.items()}
+    return watch.look(findings, awaits, FileFaults(run_at_once, lambda: None, lambda: at))
 
 
 # --- the devices of a host -----------------------------------------------------------------------
 
 
 def test_a_device_whose_file_is_gone_is_missing_until_the_file_is_back(tmp_path: Path) -> None:
-    """The device is lost after two looks, so that a driver may start again."""
+    """The device is lost after two looks a second apart, so that a driver may start again."""
     path = tmp_path / "video0"
     watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
     assert looked(watch)
     gone = f"{path}: No such file or directory"
     assert ([one.missing for one in watch.devices], watch.lost) == ([gone], {})
-    assert not looked(watch)
+    assert not looked(watch, at=0.01)  # such as after the change of another device
+    assert watch.lost == {}
+    assert not looked(watch, at=1.0)
     assert watch.lost == {("camera", "front"): gone}
     path.touch()
-    assert looked(watch)
+    assert looked(watch, at=1.01)
     assert ([one.missing for one in watch.devices], watch.lost) == ([""], {})
+    path.unlink()
+    assert looked(watch, at=5.0)
+    assert ([one.missing for one in watch.devices], watch.lost) == ([gone], {})
+
+
+def test_a_file_that_is_absent_for_a_moment_loses_no_device(tmp_path: Path) -> None:
+    """The look after the change begins a measurement whose result the next look gets."""
+    path, clock = tmp_path / "video0", FakeClock()
+    posted: list[Callable[[], None]] = []
+    watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
+
+    def run(work: Any, then: Any, failed: Any) -> PathCall:
+        return run_at_once(work, lambda fault: posted.append(lambda: then(fault)), failed)
+
+    def look() -> None:
+        watch.look({}, False, faults)
+
+    faults = FileFaults(run, look, clock)
+    look()  # finds it gone, as the next one does at once
+    for _ in range(2):
+        posted.pop(0)()
+    path.touch()
+    clock.advance(1.02)
+    look()
+    assert (watch.devices[0].missing != "", watch.lost) == (True, {})
+    posted.pop(0)()
+    assert watch.devices[0].missing == ""
+
+
+def test_two_looks_at_the_same_reading_of_a_probe_lose_no_device() -> None:
+    """A probe may have a longer period than the looks."""
+    watch = DeviceWatch({})
+    gone = {"finder": Finding((replace(GPU, missing="it has fallen off the bus"),), 3.0)}
+    for _ in range(3):
+        watch.look(gone, False, lambda _path: ("", 0.0))
+        assert watch.lost == {}
+    watch.look({"finder": gone["finder"]._replace(at=13.0)}, False, lambda _path: ("", 0.0))
+    assert list(watch.lost) == [("gpu", "0")]
+
+
+def test_a_unit_that_another_probe_may_find_is_not_lost() -> None:
+    """After a restart of the slave, one of two probes of a kind may be late or fail."""
+    configured = (GPU, Device("gpu", "a0"))
+    watch = DeviceWatch({"gpu": configured})
+    for at in (0.0, 1.0, 2.0):
+        looked(watch, {"nvidia": (GPU,)}, at=at, awaits=True)
+    assert [one.missing != "" for one in watch.devices] == [False, True]
+    assert watch.lost == {}
+    for at in (3.0, 4.0):
+        looked(watch, {"nvidia": (GPU,), "amd": ()}, at=at)
+    assert list(watch.lost) == [("gpu", "a0")]
+
+
+def test_a_probe_that_has_not_said_which_devices_are_there_is_awaited() -> None:
+    """As is one that could not be created; one that finds no devices is not."""
+    failing = Finder(OSError("no bus"))
+    failed = FailedProbe((), "cannot be created")
+    for probe, awaits in ((failing, True), (failed, True), (FakeProbe(cpu=0.5), False)):
+        sampler = sampled(probe)
+        assert sampler.awaits_devices is awaits
+        sampler.close()
 
 
 @pytest.mark.parametrize(
@@ -67,10 +134,10 @@ def test_a_look_that_cannot_be_made_leaves_a_device_as_it_was(
     path.touch()
     watch = DeviceWatch({"camera": (Device("camera", "front", str(path)),)})
     faults = FileFaults(run_at_once, lambda: None)
-    watch.look({}, faults)
+    watch.look({}, False, faults)
     if not is_there:
         path.unlink()
-        watch.look({}, faults)
+        watch.look({}, False, faults)
     before = watch.devices
 
     def refuse(_path: Path) -> None:
@@ -79,7 +146,7 @@ def test_a_look_that_cannot_be_made_leaves_a_device_as_it_was(
     caplog.set_level("INFO")
     with monkeypatch.context() as shortage:
         shortage.setattr(Path, "stat", refuse)
-        changes = [watch.look({}, faults) for _ in range(3)]
+        changes = [watch.look({}, False, faults) for _ in range(3)]
     assert not any(changes)
     assert watch.devices == before
     assert [one.message for one in caplog.records].count(
@@ -99,7 +166,7 @@ def test_a_slave_without_another_thread_keeps_its_devices(tmp_path, monkeypatch)
     faults = FileFaults(PathCalls("paths", posted.append).run, lambda: None)
     watch = DeviceWatch({"camera": (Device("camera", "front", str(tmp_path)),)})
     for _ in range(3):
-        watch.look({}, faults)
+        watch.look({}, False, faults)
         while posted:
             posted.pop()()
     assert [one.missing for one in watch.devices] == [""]
@@ -149,7 +216,7 @@ def test_a_probe_that_cannot_read_still_says_which_devices_are_there() -> None:
     probe = Finder([GPU])
     probe.fault = OSError("no answer")
     sampler = sampled(probe)
-    assert sampler.devices == {"finder": (GPU,)}
+    assert {name: one.devices for name, one in sampler.devices.items()} == {"finder": (GPU,)}
     sampler.close()
 
 
@@ -162,7 +229,7 @@ def test_a_device_of_a_subclass_is_copied_as_a_device(tmp_path: Path) -> None:
 
     sampler = sampled(Finder([Camera()]))
     watch = DeviceWatch({})
-    looked(watch, sampler.devices)
+    watch.look(sampler.devices, False, FileFaults(run_at_once, lambda: None))
     sampler.close()
     assert [one.title for one in watch.devices if one.missing] == ["camera front"]
 
@@ -197,7 +264,7 @@ def test_a_probe_that_answers_no_devices_is_stale_with_the_reason(answer, reason
     assert sampler.settle(PATIENCE)
     (report,) = sampler.latest(clock.now).reports
     assert reason in str(report)
-    assert sampler.devices == {"finder": (GPU,)}
+    assert {name: one.devices for name, one in sampler.devices.items()} == {"finder": (GPU,)}
     sampler.close()
 
 
