@@ -10,6 +10,7 @@ import os
 import time
 from typing import Final
 
+from rosrm.shortage import raise_shortage
 from rosrm.supervisor import own_log
 
 _ABSOLUTE: Final = 1
@@ -22,6 +23,9 @@ class BootTimer:
 
     Attributes:
         descriptor: readable from the deadline on; -1: a filter of system calls refuses timers.
+
+    Raises:
+        OSError: the system has no room for a timer now.
     """
 
     def __init__(self) -> None:
@@ -30,6 +34,8 @@ class BootTimer:
         try:
             self._open()
         except (ImportError, OSError) as fault:
+            if isinstance(fault, OSError):
+                raise_shortage(fault)
             own_log.write(
                 f"no timer of the boot clock: {fault}; after a suspend of this machine, fences may "
                 "be late"

@@ -95,11 +95,12 @@ class ProcessTrees:
                 os.close(pidfd)
         if not is_same:
             return False  # it ended, and its pid was given to another process
-        self._taken_over[leader.pid] = pidfd
+        self._taken_over[leader.pid] = self._watch(
+            pidfd, leader, lambda: self._taken_over_ended(key, leader.pid)
+        )
         self._add(key, leader.pid, leader.start)
         if leader.session != leader.pid:  # it is adopted
             self._in_foreign_session.add(key)
-        self._watch(pidfd, leader, lambda: self._taken_over_ended(key, leader.pid))
         return True
 
     def look(self, now: float) -> None:
@@ -279,10 +280,10 @@ class ProcessTrees:
     def _watch_stray(self, key: Key, stat: Stat, watched: dict[int, int]) -> None:
         pid = stat.pid
         try:
-            pidfd = watched[pid] = procfs.open_pidfd(pid)
+            pidfd = procfs.open_pidfd(pid)
         except ProcessLookupError:
             return
-        self._watch(pidfd, stat, lambda: self._stray_ended(key, pid))
+        watched[pid] = self._watch(pidfd, stat, lambda: self._stray_ended(key, pid))
 
     def _stray_ended(self, key: Key, pid: int) -> None:
         watched = self._strays[key]
@@ -345,11 +346,18 @@ class ProcessTrees:
         """Return True if another process may be watched by a descriptor."""
         return len(self._selector.get_map()) < self._most_watched
 
-    def _watch(self, pidfd: int, stat: Stat, ended: Callable[[], None]) -> None:
-        if pidfd == _NO_PIDFD:
-            self._looked_at[stat.pid] = (stat.start, ended)
-        else:
-            self._selector.register(pidfd, selectors.EVENT_READ, ended)
+    def _watch(self, pidfd: int, stat: Stat, ended: Callable[[], None]) -> int:
+        """Watch a process; return its pidfd, or `_NO_PIDFD` if it is looked at instead."""
+        if pidfd != _NO_PIDFD:
+            try:
+                self._selector.register(pidfd, selectors.EVENT_READ, ended)
+            except OSError as error:  # such as the bound on all selectors of this user
+                own_log.write(f"{stat.pid} is looked at once a second: {error}")
+                os.close(pidfd)
+            else:
+                return pidfd
+        self._looked_at[stat.pid] = (stat.start, ended)
+        return _NO_PIDFD
 
     def _unwatch(self, pidfd: int) -> None:
         if pidfd != _NO_PIDFD:

@@ -198,15 +198,20 @@ class Server:
         starts = self._starts.values()
         deadlines += [start.due if self._is_late(start) else start.late for start in starts]
         due = [deadline for deadline in deadlines if deadline is not None]
-        self._set_timer(deadlines[0])
+        _guarded(self._set_timer, deadlines[0])
         return min(max(0.0, min(due) - clocks.boot_time()), LONGEST_WAIT) if due else None
 
     def _set_timer(self, deadline: float | None) -> None:
         """Set the timer by which the loop wakes at a deadline of the core, also after a suspend."""
         if self._timer is None and deadline is not None:
-            self._timer = BootTimer()
-            if self._timer.descriptor >= 0:
-                self._watch(self._timer.descriptor, self._timer.clear)
+            timer = BootTimer()
+            if timer.descriptor >= 0:
+                try:
+                    self._watch(timer.descriptor, timer.clear)
+                except OSError:
+                    os.close(timer.descriptor)
+                    raise
+            self._timer = timer  # only now: after a failure the next round tries again
         if self._timer is not None:
             self._timer.set(deadline)
 

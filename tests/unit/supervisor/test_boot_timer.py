@@ -11,6 +11,7 @@ import pytest
 
 from rosrm import clocks
 from rosrm.supervisor.boot_timer import BootTimer
+from tests.limits import no_more_files
 from tests.waiting import PATIENCE
 
 
@@ -60,3 +61,9 @@ def test_a_machine_without_such_timers_is_no_fault(monkeypatch, capfd) -> None:
     timer.set(0.0)
     assert timer.descriptor == -1
     assert "after a suspend of this machine, fences may be late" in capfd.readouterr().err
+
+
+def test_a_shortage_of_descriptors_is_no_missing_timer() -> None:
+    """The caller tries again, as the shortage ends."""
+    with no_more_files(), pytest.raises(OSError, match="Too many open files"):
+        BootTimer()

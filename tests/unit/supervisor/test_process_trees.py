@@ -141,6 +141,25 @@ def test_strays_beyond_the_descriptors_are_found_when_a_watched_one_ends(tmp_pat
     assert happened == [SessionEnded(TALKER)]
 
 
+def test_the_end_of_a_process_that_the_selector_refuses_is_found(tmp_path, monkeypatch):
+    """The system bounds the descriptors that all selectors of a user may watch."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    happened: list[object] = []
+    its = trees(str(tmp_path), happened)
+    monkeypatch.setattr(its._selector, "register", refuse)
+    other = ("other", 1)
+    with subprocess.Popen(["sleep", "100"]) as stray, subprocess.Popen(["sleep", "100"]) as leader:
+        its.watch_strays(TALKER, [procfs.read_stat(stray.pid)])
+        assert its.take_over(other, procfs.read_stat(leader.pid))
+        stray.kill()
+        leader.kill()
+    its.look(1.0)
+    assert set(happened) == {SessionEnded(TALKER), Exited(other, UNKNOWN_EXIT)}
+
+
 def test_a_thread_that_ends_meanwhile_hides_no_children_of_the_others(monkeypatch):
     """An adopted process may have many threads; a child that is not found would outlive it."""
     listed = os.listdir
