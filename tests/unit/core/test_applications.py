@@ -14,12 +14,14 @@ from rosrm.core.slave import events as slave_events
 from rosrm.model.applications import Action, ApplicationRow, Target
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import AmendInstance, StartInstance
-from rosrm.model.requester import Requester
+from rosrm.model.requester import OPERATOR, Requester
+from rosrm.model.schedules import Schedule
 from rosrm.model.values import (
     Amendment,
     GroupMembership,
     InstanceState,
     InstanceStatus,
+    Kind,
     Limits,
     MigrationPolicy,
     ProcessSpec,
@@ -27,7 +29,7 @@ from rosrm.model.values import (
     RestartPolicy,
     StartOrder,
 )
-from tests.unit.core.cluster import GIB, Cluster, Machine, job, movable, process
+from tests.unit.core.cluster import GIB, Cluster, Machine, job, movable, node, process
 from tests.unit.core.test_handoffs import stateful
 
 ADA, BOB = Requester("user:ada"), Requester("user:bob")
@@ -495,6 +497,62 @@ def test_the_same_request_does_not_forget_a_replacement_that_has_begun() -> None
     cluster.finish("p", code=1)
     cluster.wait(20.0)
     assert [program(cluster, name) for name in "pq"] == [("run", "it")] * 2
+    assert state_of(cluster) == (1, [])
+
+
+@pytest.mark.parametrize("schedule", [Schedule(), Schedule(every=3600.0)], ids=["once", "hourly"])
+@pytest.mark.parametrize("policy", [MigrationPolicy(), MigrationPolicy("relaunch")])
+def test_a_job_that_completes_during_its_replacement_has_not_failed(
+    policy: MigrationPolicy, schedule: Schedule
+) -> None:
+    """The new version runs once, or at the next run of the schedule; the former one never again."""
+    cluster = Cluster("a")
+    batch = job("batch", schedule=schedule, migration=policy)
+    cluster.apply("nav", batch)
+    cluster.wait(3.0)
+    target = Target("nav", (replace(new(batch), application="nav"),))
+    cluster.ask(happened.ApplicationsRequested, (target,), False, OPERATOR, settle=False)
+    cluster.finish("batch")
+    cluster.wait(8.0)
+    assert (state_of(cluster), cluster.recorded("application_returns")) == ((2, []), [])
+    assert cluster["batch"].spec.command == ("new",)
+    assert cluster.phase("batch") == ("scheduled" if schedule else "running")
+
+
+def being_replaced() -> Cluster:
+    """Return a cluster with a job on a, whose new version, on b, is not ready yet."""
+    cluster, batch = Cluster("a", "b"), node("batch", memory=6000.0, kind=Kind.JOB)
+    batch = replace(batch, migration=MigrationPolicy("relaunch"))
+    cluster.apply("nav", batch)
+    cluster.discover("batch")
+    cluster.wait(3.0)
+    cluster.apply("nav", new(batch))
+    cluster.wait(1.0)
+    assert (cluster.phase("batch"), cluster.where("batch")) == ("migrating", ["a", "b"])
+    return cluster
+
+
+def test_a_job_that_completes_while_its_new_version_gets_ready_has_not_failed() -> None:
+    """The new version starts once."""
+    cluster = being_replaced()
+    cluster.finish("batch", "a")
+    cluster.wait(1.0)
+    cluster.discover("batch", cluster.where("batch")[0])
+    cluster.wait(3.0)
+    assert (program(cluster, "batch"), state_of(cluster)) == (("new",), (2, []))
+    assert cluster.recorded("application_returns") == []
+
+
+def test_a_job_that_completes_after_its_new_version_has_failed_stays_finished() -> None:
+    """The application returns to the former version, whose work is done."""
+    cluster = being_replaced()
+    cluster.machines["b"].stubborn.add("batch")
+    cluster.wait(30.0)
+    assert len(cluster.recorded("migration_undone")) == 1
+    cluster.finish("batch", "a")
+    cluster.let_go("batch", "b")
+    cluster.wait(30.0)
+    assert (cluster.phase("batch"), cluster.where("batch")) == ("finished", [])
     assert state_of(cluster) == (1, [])
 
 

@@ -310,7 +310,7 @@ def test_a_source_that_ends_during_the_move_ends_the_move() -> None:
     cluster.migrate("p")
     cluster.finish("p")
     assert (cluster.phase("p"), cluster.where("p")) == ("finished", [])
-    assert cluster.recorded("stayed") == ["p stayed on a: p#1 ended during the move"]
+    assert cluster.recorded("stayed") == ["p stayed on a: p#1 ran to completion during the move"]
 
 
 def test_a_job_that_completes_before_its_stop_order_arrives_has_finished() -> None:

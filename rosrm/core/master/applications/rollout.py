@@ -104,7 +104,9 @@ def _review(state: MasterState, application: Application, now: float) -> None:
             done = _stop(state, application, name, now)
         else:
             task.awaits_host = False
-            done = _advance(state, application, task, spec, now, may_replace=replacing < most)
+            done = not task.fault and _advance(
+                state, application, task, spec, now, may_replace=replacing < most
+            )
             note_wait(state, application, task, spec, now)
             replacing += _is_replaced(state, name, task) and not was_replaced
         if done:
@@ -159,8 +161,10 @@ def _advance(
     _change_in_place(state, process, spec, now)
     if spec == state.spec_to_be(process):
         return process.next_spec is None and _runs_well(state, application, task, process, now)
-    if task.begun and process.name not in state.migrations:
-        task.fault = task.fault or "its new version did not start"
+    if process.phase is ProcessPhase.SCHEDULED and (task.begun or may_replace):
+        _replace(state, application, task, process, spec, now)
+    elif task.begun and process.name not in state.migrations:
+        task.fault = "its new version did not start"
     # A process in back-off does not run: its replacement interrupts nothing.
     elif not task.begun and (may_replace or process.phase is ProcessPhase.BACKOFF):
         _replace(state, application, task, process, spec, now)

@@ -271,17 +271,14 @@ def _undo_reason(state: MasterState, migration: Migration) -> str:
         return f"a cancellation of {migration.process} was requested"
     if _is_given_up(state, migration):
         return f"the application now requires the version that {migration.source} runs"
-    end = migration.ended.get(migration.source.number)
-    if end is None:
-        return ""
     expected = (
         _was_ordered_to_stop(migration, migration.source)
         or handoff.is_switching(migration)
         or _has_left_in_image(migration)
     )
-    if expected and not end.completed:
-        return ""
-    return f"{migration.source} ended during the {migration.aim.value}"
+    if migration.source.number not in migration.ended or expected:
+        return migration.completion
+    return migration.completion or f"{migration.source} ended during the {migration.aim.value}"
 
 
 def _has_left_in_image(migration: Migration) -> bool:
@@ -294,9 +291,8 @@ def _has_left_in_image(migration: Migration) -> bool:
 
 def _resumes(state: MasterState, migration: Migration) -> bool:
     """Return True if the source must run again: its process is neither cancelled nor completed."""
-    end = migration.ended.get(migration.source.number)
-    completed = end is not None and end.completed
-    return not completed and state.processes[migration.process].wanted is DesiredState.RUN
+    wanted = state.processes[migration.process].wanted
+    return not migration.completion and wanted is DesiredState.RUN
 
 
 def _was_ordered_to_stop(migration: Migration, instance: InstanceId) -> bool:
@@ -316,7 +312,7 @@ def _conclude(state: MasterState, migration: Migration, now: float) -> None:
     process = state.processes[migration.process]
     moved = migration.undo is None
     process.moved_at = now
-    if migration.spec is not None and not moved:
+    if migration.spec is not None and not moved and migration.failure != migration.completion:
         _note_not_replaced(state, process, migration)
     standby = state.standbys.get(migration.process)
     kept = {process.owner, standby.destination.number if standby else 0}
@@ -368,7 +364,7 @@ def _note_not_replaced(state: MasterState, process: Process, migration: Migratio
     application = state.applications.get(process.spec.application)
     task = application.tasks.get(process.name) if application is not None else None
     if application is not None and task is not None and task.begun:
-        task.fault = migration.failure or "it was stopped"
+        task.fault = migration.failure
         state.save_application(application)
 
 

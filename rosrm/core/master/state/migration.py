@@ -155,6 +155,17 @@ class Migration:
         return any(result.get("active") is True for result in self.results.values())
 
     @property
+    def completion(self) -> str:
+        """Return the sentence that the source, a job, has run to completion; "": it has not.
+
+        As the reason of an undo this is no failure: no version of the job has failed.
+        """
+        end = self.ended.get(self.source.number)
+        if end is None or not end.completed:
+            return ""
+        return f"{self.source} ran to completion during the {self.aim.value}"
+
+    @property
     def progress_text(self) -> str:
         """Return the reason shown for the process during the migration."""
         host = self.destination_host.name
