@@ -49,10 +49,14 @@ def in_order(after: Mapping[str, Iterable[str]]) -> list[str]:
 
 def condition_fault(dependency: ProcessSpec, condition: StartCondition) -> str:
     """Return why no process can await this condition of a dependency; "": it can."""
-    if condition != "finished" or dependency.kind is Kind.JOB:
-        return ""
     name = dependency.name
-    return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
+    if condition != "finished":
+        return ""
+    if dependency.kind is not Kind.JOB:
+        return f"{name} is a service, which does not finish; use `ready` or declare it as a job"
+    if dependency.schedule:
+        return f"{name} has a schedule, so it never finishes; use `ready`, or remove its schedule"
+    return ""
 
 
 def circle_fault(circle: Sequence[str]) -> str:

@@ -121,7 +121,7 @@ def _awaited(state: MasterState, process: Process, now: float) -> str:
         return f"waits for the end of its delay of {order.delay:g} s after {listed(order.after)}"
     missing = [name for name, since in held_since.items() if since == inf]
     conditions = listed(f"for {name} {_TO_BE[order.after[name]]}" for name in missing)
-    obstacles = [_obstacle(state, name) for name in missing]
+    obstacles = [_obstacle(state, name, order.after[name]) for name in missing]
     return "; ".join([f"waits {conditions}", *filter(None, obstacles)])
 
 
@@ -136,7 +136,7 @@ def _holds_since(state: MasterState, name: str, condition: StartCondition) -> fl
     return process.since if holds else inf
 
 
-def _obstacle(state: MasterState, name: str) -> str:
+def _obstacle(state: MasterState, name: str, condition: StartCondition) -> str:
     """Return why a condition may never hold without help, and what helps; "": it may."""
     process = state.processes.get(name)
     if process is None:
@@ -145,6 +145,9 @@ def _obstacle(state: MasterState, name: str) -> str:
         return f"{name} is being cancelled"
     if process.phase.is_terminal:
         return f"{name} {standing(process.phase.value)}: `rosrm restart {name}` starts it again"
+    fault = condition_fault(process.spec, condition)  # its spec may have changed since the check
+    if fault:
+        return fault
     return f"{name} {standing(process.phase.value)}" if process.phase in _NEEDS_HELP else ""
 
 
@@ -246,4 +249,4 @@ def _dependency_fault(
     if name in starting or process is None or _holds_since(state, name, condition) < inf:
         return ""
     ends = process.wanted is DesiredState.CANCEL or process.phase.is_terminal
-    return _obstacle(state, name) if ends else ""
+    return _obstacle(state, name, condition) if ends else ""

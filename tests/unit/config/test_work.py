@@ -295,6 +295,10 @@ def test_an_empty_spread_of_an_entry_for_many_means_different_hosts(file):
     ("a", "b", "text"),
     [
         ("", "after: {a: finished}", ":4:38: after: a is a service, which does not finish; use"),
+        (
+            "kind: job, every: 1h", "after: {a: finished}",
+            ":4:38: after: a has a schedule, so it never finishes; use",
+        ),
         ("near: b, apart: b", "", ":3:5: a and b must run apart, and near each other: no hosts"),
         (
             "near: b, labels: {required: {arm: left}}", "labels: {required: {arm: right}}",

@@ -7,6 +7,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import RestartInstance, StopInstance
+from rosrm.model.schedules import Schedule
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceState,
@@ -17,6 +18,8 @@ from rosrm.model.values import (
     StopPolicy,
 )
 from tests.unit.core.cluster import Cluster, Machine, job, movable, node, process
+
+HOURLY = Schedule(every=3600.0)
 
 
 def after(*names: str, delay: float = 0.0, restart: bool = False, **conditions: str) -> StartOrder:
@@ -275,6 +278,10 @@ REFUSED = {
         [process("b", start_order=after(camera="finished"))],
         "b: after: camera is a service, which does not finish; use `ready` or declare it as a job",
     ),
+    "the end of a job with a schedule": (
+        [job("tick", schedule=HOURLY), process("b", start_order=after(tick="finished"))],
+        "b: after: tick has a schedule, so it never finishes; use `ready`, or remove its schedule",
+    ),
     "a service that has ended": (
         [dependant("b", "ended")],
         "b: after: ended has finished: `rosrm restart ended` starts it again",
@@ -293,6 +300,16 @@ def test_a_start_order_that_cannot_be_kept_is_refused(specs: list[ProcessSpec], 
     reply = cluster.submit(process("p"), *specs)
     assert (reply.accepted, reply.message) == (False, f"{says}. Nothing was queued")
     assert set(cluster.state.processes) == set(names)
+
+
+def test_a_wait_for_the_end_of_a_job_that_got_a_schedule_names_the_schedule() -> None:
+    """The dependency was accepted without one."""
+    cluster = Cluster("a")
+    cluster.apply("work", job("batch"))
+    cluster.submit(process("b", start_order=after(batch="finished")))
+    cluster.apply("work", job("batch", schedule=HOURLY))
+    cluster.wait(5.0)
+    assert "waits for batch to finish; batch has a schedule, so it" in cluster["b"].reason
 
 
 def test_a_circle_through_processes_that_run_is_refused() -> None:
