@@ -51,13 +51,7 @@ def orders_from(
         starting: processes with the order that they will have.
         mates: name of a process to those of its gang, which is followed as a whole.
     """
-    given = {spec.name: [spec] for spec in starting}
-    pending = {
-        name: application.specs[name]
-        for application in state.applications.values()
-        for name in application.tasks
-        if name in application.specs
-    }
+    given, pending = {spec.name: [spec] for spec in starting}, pending_specs(state)
     names, found = list(given), dict[str, Sequence[str]]()
     for name in names:  # they become more
         if name not in found:
@@ -67,6 +61,16 @@ def orders_from(
             )
             names += (*found[name], *mates.get(name, ()))
     return found
+
+
+def pending_specs(state: MasterState) -> dict[str, ProcessSpec]:
+    """Return the specs that unfinished work on applications brings into force, by name."""
+    return {
+        name: application.specs[name]
+        for application in state.applications.values()
+        for name in application.tasks
+        if name in application.specs
+    }
 
 
 def _specs_of(state: MasterState, name: str, pending: ProcessSpec | None) -> list[ProcessSpec]:

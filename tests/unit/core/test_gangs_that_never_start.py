@@ -10,7 +10,7 @@ import pytest
 from rosrm.core.master.migration.preemption import preempt
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.values import NeighbourRule, ProcessSpec, StartOrder
-from tests.unit.core.cluster import Cluster, job, movable, process
+from tests.unit.core.cluster import Cluster, job, movable, node, process
 from tests.unit.core.test_gangs import machine, preempted
 
 
@@ -57,6 +57,59 @@ def test_a_gang_that_can_never_start_is_refused(
     assert not reply.accepted
     assert reply.message.startswith(says)
     assert not cluster.state.processes
+
+
+def test_a_version_whose_gang_could_never_start_does_not_return() -> None:
+    """Another application starts after a process of the gang since, and the gang after its own."""
+    cluster = Cluster("h")
+    cluster.apply("two", process("c"))
+    cluster.apply("one", member("a"), member("b", "c"))
+    cluster.wait(3.0)
+    alone = member("a", together="")
+    assert cluster.apply("one", alone, process("x"), healthy_for=30.0).accepted
+    cluster.wait(1.0)
+    assert cluster.apply("two", member("c", "a", together="", command=("new",))).accepted
+    cluster.wait(3.0)
+    for name in ("a", "x"):
+        cluster.finish(name, "h", code=1)
+    cluster.wait(3.0)
+    (said,) = cluster.recorded("application_failed")
+    assert "one is paused: " in said
+    assert "the former version 1 does not return: b: after: b starts after c and c st" in said
+    assert cluster.recorded("application_returns") == []
+
+
+def test_a_process_that_the_former_version_lacks_does_not_prevent_the_return() -> None:
+    """In the failed version d waits, through x, for a process outside its gang."""
+    cluster = Cluster("h")
+    cluster.apply("one", member("a"), member("b"))
+    cluster.wait(3.0)
+    other = replace(node("x"), start_order=StartOrder({"a": "ready"}))
+    assert cluster.apply("one", member("a", together=""), other, member("d", "x")).accepted
+    cluster.wait(1.0)
+    assert cluster.phase("d") == "queued"
+    for name in ("a", "x"):
+        cluster.finish(name, "h", code=1)
+    cluster.wait(3.0)
+    assert {cluster.phase(name) for name in "ab"} == {"running"}
+
+
+def test_a_process_that_joins_its_gang_later_counts() -> None:
+    """Its application starts it once its former instance has ended."""
+    cluster = Cluster("h")
+    file = [member("a"), member("b", "c")]
+    cluster.apply("two", node("c"))
+    cluster.discover("c", "h")
+    cluster.apply("one", *file)
+    cluster.submit(member("d", "a", together=""))
+    cluster.restart("c")
+    cluster.machines["h"].stubborn.add("a")
+    cluster.cancel("a", "b")
+    assert cluster.apply("one", *file).accepted
+    said = cluster.apply("two", replace(node("c"), start_order=StartOrder({"d": "ready"})))
+    assert said.message.startswith(
+        "c: after: c starts after d, d starts after a and b starts after c, "
+    )
 
 
 def test_what_can_start_is_accepted() -> None:

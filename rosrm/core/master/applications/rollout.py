@@ -38,6 +38,7 @@ from rosrm.core.master.applications.difference import differences, with_changes_
 from rosrm.core.master.applications.listing import described, unwell_processes
 from rosrm.core.master.applications.replacement import Busy, NeverFits, try_replace
 from rosrm.core.master.assignment.assign import reconsider_set_aside
+from rosrm.core.master.assignment.gangs import gang_fault
 from rosrm.core.master.cancellation import cancel
 from rosrm.core.master.dependants import circle_from, dependants_first
 from rosrm.core.master.master_state import MasterState
@@ -325,9 +326,9 @@ def _handle_fault(
         return
     cancelled = frozenset(filter(partial(_stays_cancelled, state, application), version.specs))
     pauses = version.rollout.on_failure == "pause"
-    circle = "" if pauses else _circle_of_return(state, application, cancelled)
-    if pauses or circle:
-        why += circle and f"; the former version {application.former} does not return: {circle}"
+    fault = "" if pauses else _fault_of_return(state, application, cancelled)
+    if pauses or fault:
+        why += fault and f"; the former version {application.former} does not return: {fault}"
         application.paused = why
         _note(state, application, now, EventKind.APPLICATION_FAILED, f"is paused: {why}")
     else:
@@ -337,16 +338,28 @@ def _handle_fault(
         _set_wanted(state, application, application.former, now, former=0, stay_cancelled=cancelled)
 
 
-def _circle_of_return(
+def _fault_of_return(
     state: MasterState, application: Application, stay_cancelled: AbstractSet[str]
 ) -> str:
-    """Return a sentence on a circle of start orders that the former version would close; "": none.
+    """Return why the former version could never start; "": it may.
 
     Other applications may have changed since that version was checked.
     """
     former = application.versions.get(application.former)
     given = former.specs.values() if former is not None else ()
-    return circle_from(state, [spec for spec in given if spec.name not in stay_cancelled])
+    specs = {spec.name: spec for spec in given if spec.name not in stay_cancelled}
+    found = differences(state, application.name, specs, ())
+    joining = {
+        name: (application.principal, spec.together)
+        for name, spec in specs.items()
+        if spec.together
+        and (
+            (name in found and found[name].action is Action.START)
+            or (name in state.processes and state.processes[name].phase in WAITING)
+        )
+    }
+    coming, leaving = list(specs.values()), application.specs.keys() - specs.keys()
+    return circle_from(state, coming) or gang_fault(state, coming, joining, leaving)
 
 
 def _is_cancelled(state: MasterState, name: str) -> bool:

@@ -15,6 +15,7 @@ cancellation                  the process leaves the gang, and the others do not
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 from math import inf
 from typing import Final
@@ -23,7 +24,7 @@ from rosrm.core.master import lifecycle
 from rosrm.core.master.assignment.demands import demand_of
 from rosrm.core.master.assignment.gang_search import MOST_MEMBERS, Blocked, find_places_if_empty
 from rosrm.core.master.assignment.neighbours import neighbours_of
-from rosrm.core.master.dependants import orders_from
+from rosrm.core.master.dependants import orders_from, pending_specs
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.outcomes import RequestRefused
 from rosrm.core.master.scheduling.feasibility import a_known_host_may, why_never
@@ -67,26 +68,37 @@ def check_gangs(
                 "name_taken",
             )
     gang_of = {spec.name: (principal, spec.together) for spec in specs if spec.together}
-    fault = _start_fault(state, requested, gang_of)
+    fault = gang_fault(state, requested, gang_of)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
 
 
-def _start_fault(
-    state: MasterState, requested: Sequence[ProcessSpec], joining: Mapping[str, GangKey]
-) -> str:
-    """Return why a gang could never start after a request; "": each may.
+def gang_fault(
+    state: MasterState, coming: Sequence[ProcessSpec], joining: Mapping[str, GangKey],
+    leaving: AbstractSet[str] = frozenset(),
+) -> str:  # fmt: skip
+    """Return why a gang could never start once specs are in force; "": each may.
 
-    `joining`: those of the processes that start with their gang.
+    Args:
+        state: has the processes and gangs that wait, and those that applications start later.
+        coming: specs that come into force, by a request or by a return; without a circle.
+        joining: those of the processes that start with their gang.
+        leaving: names of processes that are cancelled.
     """
-    given = {spec.name: spec for spec in requested}
+    given, planned = {spec.name: spec for spec in coming}, pending_specs(state)
+    pending = {
+        name: (state.applications[spec.application].principal, spec.together)
+        for name, spec in planned.items()
+        if spec.together and name not in given and _starts_again(state, name)
+    }
     waiting = {
         name: gang
         for gang, names in state.gangs.members.items()
         for name in names
         if gang is not None and (name not in given or given[name].together == gang[1])
     }
-    gang_of = {**waiting, **joining}
+    known = {**pending, **waiting, **joining}
+    gang_of = {name: gang for name, gang in known.items() if name not in leaving}
     if not gang_of:
         return ""
     members: dict[GangKey, list[str]] = {}
@@ -95,10 +107,21 @@ def _start_fault(
     mates = {name: members[gang] for name, gang in gang_of.items()}
     joined = set(joining.values())
     changed = {name: gang for name, gang in gang_of.items() if gang in joined}
-    specs = {name: given.get(name) or state.processes[name].spec for name in changed}
+    specs = {
+        name: given.get(name) or planned.get(name) or state.processes[name].spec
+        for name in changed
+    }  # fmt: skip
     fault = gang_array_fault(changed, specs)
-    fault = fault or gang_order_fault(gang_of, orders_from(state, requested, mates))
+    fault = fault or gang_order_fault(gang_of, orders_from(state, coming, mates))
     return f"{fault.process}: {fault.text}" if fault is not None else ""
+
+
+def _starts_again(state: MasterState, name: str) -> bool:
+    """Return True if a desired process does not live, so that it joins its gang when it starts."""
+    process = state.processes.get(name)
+    if process is None or process.phase.is_terminal:
+        return True
+    return process.wanted is DesiredState.CANCEL
 
 
 def members_of(state: MasterState, process: Process) -> list[Process]:
