@@ -66,8 +66,8 @@ class ArchiveWriter:
         self._segments = read_segments(self._directory)
         self._unchecked = self._limits.keep
         self._doubted = {
-            source: zero for source, segment in self._stored()
-            if segment.is_open and (zero := _first_zero(segment)) >= 0
+            source: zero for source, (*_, last) in self._segments.items()
+            if last.is_open and (zero := _first_zero(last)) >= 0
         }  # fmt: skip
 
     def position(self, source: Source) -> int:

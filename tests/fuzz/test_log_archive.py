@@ -29,6 +29,7 @@ CONTENT = st.binary(max_size=200).flatmap(lambda text: st.sampled_from([text, gz
     since=st.sampled_from([0.0, 1.0, 4e9]), offset=st.integers(0, 300),
 )  # fmt: skip
 @example({"p.1.0.0-9.log.gz": gzip.compress(b"x" * 9)[:-4]}, 0, 0.0, 0)
+@example({"p.1.0.0.log": b"\0", "p.1.1.9-3.log.gz": b""}, 0, 0.0, 0)  # an open one is not the last
 @settings(max_examples=200, deadline=None)
 def test_a_damaged_archive_is_read_or_refused(files, tail, since, offset):
     """The next collector can also continue with the archive."""
