@@ -20,6 +20,8 @@ PUBLIC = ("rosrm.node", "rosrm.testing")
 MORE = {
     "plugins/container/rosrm_container/podman.py": {"rosrm.shortage"},
     "plugins/migration/rosrm_migration/handoff.py": {"rosrm.ros.slave.publisher_watch"},
+    "plugins/resources/rosrm_resources/cgroups.py": {"rosrm.shortage"},
+    "plugins/resources/rosrm_resources/cpu.py": {"rosrm.shortage"},
     "examples/rosrm_examples/demo_job.py": {"rosrm.config.settings"},
     "examples/rosrm_examples/demo_run.py": {"rosrm.supervisor.client"},
     "examples/rosrm_examples/demo_screen.py": {"rosrm.cli.output.top"},
