@@ -65,11 +65,11 @@ class PluginCreation:
         """Return the probes; a `FailedProbe` stands for one that is not created."""
         return self._listed.probes
 
-    def wait(self, meanwhile: Callable[[], None], ends: Callable[[], bool]) -> None:
+    def wait(self, renew: Callable[[], None], ends: Callable[[], bool]) -> None:
         """Wait until all are created, but at most `BUDGET` seconds.
 
         Args:
-            meanwhile: called about twice a second.
+            renew: renews the fences; called about twice a second.
             ends: returns True if the slave is to end.
 
         Raises:
@@ -77,7 +77,7 @@ class PluginCreation:
         """
         until = clocks.awake_time() + BUDGET
         while self._awaited and not ends() and (left := until - clocks.awake_time()) > 0.0:
-            meanwhile()
+            renew()
             try:
                 self._take(*self._created.get(timeout=min(left, _TICK)))
             except Empty:

@@ -290,7 +290,7 @@ def test_a_fork_of_a_plugin_holds_no_lock(make_cluster: Make) -> None:
 def test_a_probe_that_hangs_at_a_restart_of_its_slave_ends_no_process(
     make_cluster: Make, guest: Path
 ) -> None:
-    """The slave starts without it, renews the fences meanwhile, and reads it once it is created."""
+    """The slave renews the fences, starts without it, and reads it once it is created."""
     cluster = _with_probe(make_cluster, "late", limits={"memory": 0.9, "late": 0.9})
     cluster.submit(service("kept", host_loss=HostLossPolicy("elsewhere")))
     before = cluster.wait("kept", "running")

@@ -222,7 +222,7 @@ def test_a_loss_of_power_during_an_append_leaves_no_zeros_and_doubles_nothing(ri
 
 @pytest.mark.parametrize("left", [0, 10], ids=["gone", "rotated"])
 def test_zeros_of_a_log_whose_host_has_them_no_more_stay(rig, left):
-    """Its own zeros, for example: nothing is removed for what nobody can send again."""
+    """Its own zeros, for example: nothing is removed that the host cannot send again."""
     rig.alpha.write(b"one\n\0\0\0\0three\n")
     rig.collect()
     rig.alpha.write(b"four\n")

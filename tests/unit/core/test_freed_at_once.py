@@ -1,7 +1,6 @@
-"""What the master forgets is freed at once, without a collection of garbage, which is rare."""
+"""Forgotten processes are freed at once, without a collection of garbage, which is rare."""
 
-import gc
-
+from tests.garbage import cyclic_garbage
 from tests.unit.core.cluster import Cluster, job
 
 
@@ -9,19 +8,10 @@ def test_an_ended_job_that_is_forgotten_leaves_no_cycle_of_references():
     """Its decision, with the views for plugins, is freed by the count of its references."""
     cluster = Cluster("a", "b", keep_ended=3)
     _run_jobs(cluster, 10)
-    gc.collect()
-    gc.disable()
-    try:
+    with cyclic_garbage() as left:
         _run_jobs(cluster, 30, first=10)
         assert len(cluster.state.processes) < 30
-        gc.set_debug(gc.DEBUG_SAVEALL)
-        gc.collect()
-        kinds = {type(one).__qualname__ for one in gc.garbage}
-    finally:
-        gc.set_debug(0)
-        gc.garbage.clear()
-        gc.enable()
-    assert kinds == set()
+    assert set(left) == set()
 
 
 def _run_jobs(cluster: Cluster, count: int, first: int = 0) -> None:

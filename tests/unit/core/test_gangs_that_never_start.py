@@ -51,7 +51,7 @@ REFUSED = {
 def test_a_gang_that_can_never_start_is_refused(
     specs: list[ProcessSpec], says: str, applied: bool
 ) -> None:
-    """The master refuses it, too, whoever reads the file."""
+    """The master refuses it as the loader of files does."""
     cluster = Cluster("h")
     reply = cluster.apply("app", *specs) if applied else cluster.submit(*specs)
     assert not reply.accepted
@@ -213,7 +213,7 @@ def test_no_process_makes_room_for_a_gang_of_which_one_is_not_in_the_queue() -> 
 
 
 def test_a_claim_stops_no_further_process_while_its_gang_waits() -> None:
-    """It stands until its deadline, because the wait may be short."""
+    """The claim stays until its deadline, because the wait may be short."""
     cluster = waiting_for_room(member("second", "c", priority=5), max_migrations=1)
     while not preempted(cluster, "x") + preempted(cluster, "y"):
         cluster.wait(0.5)

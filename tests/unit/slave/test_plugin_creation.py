@@ -69,7 +69,7 @@ def probe(name: str, create: Any = None, *, reads: tuple[str, ...] = ()) -> Prob
 
 
 def wait(one: PluginCreation) -> int:
-    """Wait as a starting slave does; return the number of calls meanwhile."""
+    """Wait as a starting slave does; return the number of calls during the wait."""
     calls: list[None] = []
     one.wait(lambda: calls.append(None), lambda: False)
     return len(calls)
