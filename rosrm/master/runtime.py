@@ -60,6 +60,7 @@ from rosrm.ros.master.search import ASK_EVERY, MasterSearch
 from rosrm.ros.master.services import MasterIdentity
 from rosrm.ros.participant import Participant
 from rosrm.ros.sealed import SealedEndpoints
+from rosrm.runtime import durable
 from rosrm.runtime.bootstrap import end_start, handle_signals
 from rosrm.runtime.state_lock import only_one
 from rosrm.runtime.worker import Worker
@@ -327,33 +328,37 @@ class MasterRuntime:
         """Serve until a signal to stop; returns the exit code."""
         end_start()
         self._process.keep_own()
-        next_tick = next_beat = next_restore = self._now()
         with self._closing:
-            while not self._stopping:
-                self._participant.spin(max(0.0, next_tick - self._now()))
-                while self._from_threads:
-                    self._participant.guard.call(self._from_threads.popleft())
-                now = self._now()
-                self._deadlines.begin_turn()
-                self._reload.chains.begin_turn()
-                self._leave_out_suspend()
-                if now >= next_tick:
-                    next_tick = now + _TICK
-                    self._tick(now)
-                if now >= next_beat:
-                    next_beat = now + self._config.control.beat_period
-                    self._beat(now)
-                if now >= next_restore:  # what a plugin has changed in a thread
-                    next_restore = now + _RESTORE_PERIOD
-                    self._participant.guard.call(self._process.restore)
-                self._take_in(now)
-                next_tick = min(next_tick, now + self._until_loss(now))
-                if self._diagnostics is not None:
-                    self._diagnostics.advance(now, self._core_now(now), self._trouble())
-                self._endpoint.load.note_turn(self._now() - now)
+            with durable.lease_kept_here():
+                self._serve()
             self._participant.guard.call(self._process.restore)  # so that the log has the end
             self._say_stopped()
         return 1 if self._stopping.startswith("refused") else 0
+
+    def _serve(self) -> None:
+        next_tick = next_beat = next_restore = self._now()
+        while not self._stopping:
+            self._participant.spin(max(0.0, next_tick - self._now()))
+            while self._from_threads:
+                self._participant.guard.call(self._from_threads.popleft())
+            now = self._now()
+            self._deadlines.begin_turn()
+            self._reload.chains.begin_turn()
+            self._leave_out_suspend()
+            if now >= next_tick:
+                next_tick = now + _TICK
+                self._tick(now)
+            if now >= next_beat:
+                next_beat = now + self._config.control.beat_period
+                self._beat(now)
+            if now >= next_restore:  # what a plugin has changed in a thread
+                next_restore = now + _RESTORE_PERIOD
+                self._participant.guard.call(self._process.restore)
+            self._take_in(now)
+            next_tick = min(next_tick, now + self._until_loss(now))
+            if self._diagnostics is not None:
+                self._diagnostics.advance(now, self._core_now(now), self._trouble())
+            self._endpoint.load.note_turn(self._now() - now)
 
     def _beat(self, now: float) -> None:
         self._endpoint.beat(

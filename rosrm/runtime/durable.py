@@ -5,14 +5,19 @@ one. After a loss of power the content of the last half minute may be missing; a
 since then may be empty, although its name, mode and time are there.
 
 *Durably* survives the loss of power: what the function has written and named is on the disk when it
-returns. It may take as long as the disk needs, so no loop that keeps a lease calls it.
+returns. It may take as long as the disk needs, seconds on a busy one, so no loop that keeps a lease
+calls it. Such a loop runs in `lease_kept_here`, and a sync in it is logged as an error.
 """
+
+# ruff: noqa: TID251 - the one place of syncs
 
 from __future__ import annotations
 
+import _thread  # `threading` costs the supervisor 300 KiB
 import contextlib
 import errno
 import os
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Final
@@ -24,6 +29,43 @@ from rosrm.runtime.private_files import open_private, write_all
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 #: Mode that `open_private` gives.
 _PRIVATE: Final = 0o600
+#: Error of a sync that a loop must not wait for; the tests look for it in the logs of all parts.
+SYNC_IN_LOOP: Final = "waits for the disk in the loop that keeps a lease"
+#: Threads that keep a lease, by number, and the places of syncs in them.
+_lease_threads: Final[set[int]] = set()
+_logged: Final[set[str]] = set()
+
+
+@contextlib.contextmanager
+def lease_kept_here() -> Iterator[None]:
+    """Mark the calling thread as one that keeps a lease until the context ends.
+
+    It sends beats or readings. If it waited for a slow disk, its peers would take it for lost.
+    """
+    number = _thread.get_ident()
+    _lease_threads.add(number)
+    try:
+        yield
+    finally:
+        _lease_threads.discard(number)
+
+
+def check_thread() -> None:
+    """Log an error, once for each place, if the calling thread keeps a lease; called before a sync.
+
+    The sync is not refused: a late beat does less harm than a promise that was not kept.
+    """
+    if _thread.get_ident() not in _lease_threads:
+        return
+    frame = sys._getframe(1)  # noqa: SLF001 - the place of the caller
+    while frame.f_back is not None and frame.f_code.co_filename in (__file__, contextlib.__file__):
+        frame = frame.f_back
+    place = f"{frame.f_code.co_filename}:{frame.f_lineno}"
+    if place not in _logged:
+        _logged.add(place)
+        import logging  # noqa: PLC0415 - a bug is rare, and memory is budgeted
+
+        logging.getLogger("rosrm").error("%s %s: report this as a bug", place, SYNC_IN_LOOP)
 
 
 def replace_atomically(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> int:
@@ -83,7 +125,7 @@ def prepared(path: str, content: bytes) -> Iterator[Callable[[], None]]:
     try:
         try:
             write_all(file, content)
-            os.fsync(file)
+            _force(file)
         finally:
             os.close(file)
         yield partial(_give_name, new, path)
@@ -104,6 +146,7 @@ def append_durably(path: str, content: bytes) -> None:
         size = os.fstat(file).st_size
         write_all(file, content)
         try:
+            check_thread()
             os.fdatasync(file)
         except OSError:
             with contextlib.suppress(OSError):  # the first fault is the reason
@@ -144,7 +187,7 @@ def sync_directory(path: str) -> None:
     """
     directory = os.open(path or ".", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
-        os.fsync(directory)
+        _force(directory)
     except OSError as error:
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
@@ -160,9 +203,14 @@ def _give_name(new: str, path: str) -> None:
 def _sync_file(path: str) -> None:
     file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     try:
-        os.fsync(file)
+        _force(file)
     finally:
         os.close(file)
+
+
+def _force(file: int) -> None:
+    check_thread()
+    os.fsync(file)
 
 
 def _fail(error: OSError) -> None:

@@ -26,6 +26,7 @@ from rosrm.core.supervisor.instance import BACKOFF, STARTING, STOPPING
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.model import start_trace
+from rosrm.runtime import durable
 from rosrm.runtime.oom_score import score_of_children
 from rosrm.runtime.signalling import send
 from rosrm.supervisor import (
@@ -141,11 +142,12 @@ class Server:
         self._watch(self._listener, self._accept)
         self._watch_signals()
         self._take_over()  # unguarded: half of it could start processes twice
-        while True:
-            _guarded(self._round)
-            if self._leaving:
-                break
-            self._take_in(self._timeout())
+        with durable.lease_kept_here():
+            while True:
+                _guarded(self._round)
+                if self._leaving:
+                    break
+                self._take_in(self._timeout())
         self._leave()
 
     def _take_in(self, timeout: float | None) -> None:

@@ -21,6 +21,7 @@ from rosrm.config.settings import (
 from rosrm.errors import Refused
 from rosrm.model.rows import Listing, ProcessRow
 from rosrm.model.values import Kind, ProcessSpec, Readiness, StopPolicy
+from rosrm.runtime.durable import SYNC_IN_LOOP
 from rosrm.supervisor.procfs import read_environment
 from rosrm.testing.local_cluster import LocalCluster, Part
 from tests.waiting import PATIENCE, holds_for, wait_until
@@ -310,6 +311,7 @@ def end_and_check(cluster: Cluster) -> None:
     for part in cluster.parts():
         said = cluster.log_of(part.name)
         assert "Traceback" not in said, said
+        assert SYNC_IN_LOOP not in said, said
         strangers = [line for line in said.splitlines() if "without a valid key" in line]
         assert cluster.is_attacked or not strangers, strangers
         if codes[part.name] is None:  # the part was alive, and ended on a signal

@@ -71,7 +71,7 @@ def _writes(call: ast.Call) -> bool:
     if name == "touch":
         return "mode" in text or owner.startswith("(")
     if owner == "durable" or _DURABLE.fullmatch(name):
-        return True
+        return name not in {"lease_kept_here", "check_thread"}
     return name in _WRITES or (name in _MOVES and owner in {"os", "shutil"})
 
 

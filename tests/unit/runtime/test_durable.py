@@ -10,7 +10,9 @@ from typing import Any
 
 import pytest
 
+from rosrm import threads
 from rosrm.runtime import durable
+from tests.waiting import PATIENCE
 
 
 @pytest.fixture
@@ -79,3 +81,36 @@ def test_content_that_the_disk_refuses_is_taken_back(tmp_path: Path, monkeypatch
     with pytest.raises(OSError, match="Input/output error"):
         durable.append_durably(str(path), b"two\n")
     assert path.read_bytes() == b"one\n"
+
+
+@pytest.mark.parametrize(
+    "sync",
+    [
+        lambda path: durable.replace_durably(path, b"new"),
+        lambda path: durable.append_durably(path, b"more"),
+        lambda path: durable.rename_durably(path, f"{path}.kept"),
+        durable.sync,
+        lambda path: durable.sync_directory(str(Path(path).parent)),
+    ],
+)  # fmt: skip
+def test_a_sync_in_a_thread_that_keeps_a_lease_is_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, sync: Callable[[str], None]
+) -> None:
+    """Other threads may sync, and so may this one before and after its loop."""
+    path = tmp_path / "state"
+
+    def repeat() -> None:
+        for _ in range(2):
+            path.write_bytes(b"old")
+            sync(str(path))
+
+    repeat()
+    with durable.lease_kept_here():
+        other = threads.start(repeat, "other")
+        other.join(PATIENCE)
+        assert not caplog.records
+        repeat()
+    repeat()
+    (message,) = caplog.messages
+    assert message.startswith(f"{__file__}:")
+    assert durable.SYNC_IN_LOOP in message
