@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from rosrm.wording import reason_of
@@ -32,7 +32,8 @@ def protect() -> str:
         with open(_FILE, encoding="ascii") as file:
             present = int(file.read())
         if present > PROTECTED:
-            _set(PROTECTED)
+            with _writer() as write:
+                write(PROTECTED)
     except OSError as error:
         return f"{_FILE} cannot be lowered: {reason_of(error)}"
     _scores = (PROTECTED, present) if present > PROTECTED else (present, 0)
@@ -46,17 +47,19 @@ def score_of_children() -> Iterator[None]:
     if own == children:
         yield
         return
-    _set(children)
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):  # the right to lower it was lost since
-            _set(own)
+    with _writer() as write:  # held, so that the way back needs no room for an open file
+        write(children)
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):  # the right to lower it was lost since
+                write(own)
 
 
-def _set(score: int) -> None:
+@contextlib.contextmanager
+def _writer() -> Iterator[Callable[[int], object]]:
     descriptor = os.open(_FILE, os.O_WRONLY | os.O_CLOEXEC)
     try:
-        os.write(descriptor, b"%d" % score)
+        yield lambda score: os.pwrite(descriptor, b"%d" % score, 0)
     finally:
         os.close(descriptor)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
-import signal
 from collections.abc import Callable, Generator, Iterator
 from typing import Final, NamedTuple, TypeVar
 
 from rosrm.core.supervisor.rules import Key, LimitRule
-from rosrm.runtime.signalling import send
 from rosrm.supervisor import group_trees
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused
 from rosrm.supervisor.spawn import Attempt, Scheduler
@@ -62,7 +60,7 @@ class Confinement:
         self._cpus = os.sched_getaffinity(0)
 
     def start(self, key: Key, limits: LimitRule, spawn: Spawn) -> Steps[Confined]:
-        """Start an instance within its limits.
+        """Start an instance within its limits; after an exception the caller kills its process.
 
         Raises:
             SpawnError: it cannot be started, or its limits are required and cannot be enforced.
@@ -191,7 +189,7 @@ def _nice_fault(pid: int, limits: LimitRule) -> dict[str, str]:
     """Return why a process that was just started has another niceness, if it has.
 
     Raises:
-        SpawnError: the niceness is required; the process is killed.
+        SpawnError: the niceness is required.
     """
     try:
         actual = os.getpriority(os.PRIO_PROCESS, pid)
@@ -199,8 +197,6 @@ def _nice_fault(pid: int, limits: LimitRule) -> dict[str, str]:
         return {}
     if actual == limits.nice:
         return {}
-    if limits.required:
-        send(pid, signal.SIGKILL)
     fault = {"nice": f"it is {actual}, because CAP_SYS_NICE is required for {limits.nice}"}
     _check_required(limits, fault)
     return fault

@@ -32,6 +32,8 @@ from rosrm.wording import counted, reason_of, size
 _WALKS: Final = 20
 #: Seconds between two attempts to remove a group that the kernel still counts as used.
 _REMOVE_AGAIN: Final = 0.2
+#: Seconds between two attempts of the supervisor to leave the group of an instance.
+_RETURN_AGAIN: Final = 1.0
 #: Links of a folder without folders in it.
 _LINKS: Final = 2
 #: Bytes; a limit above this is none (version 1 writes 2**63 less a page).
@@ -57,6 +59,7 @@ class InstanceGroups:
         self._prepared: dict[Key, LimitRule] = {}  # limits of groups made ahead without a fault
         self._emptied: dict[str, float] = {}
         self._homes: dict[str, int] = {}  # group to descriptor of its `tasks` file, for the return
+        self._left: dict[str, float] = {}  # groups to return to, with the time of the next attempt
         self._unfinished: dict[Key, set[Tree]] = {}  # groups that some processes did not enter
 
     def find_again(self, live: Mapping[Key, int]) -> None:
@@ -207,22 +210,32 @@ class InstanceGroups:
                     left.callback(os.close, group)
                 else:
                     # A thread that moves itself alone needs no grace period; this is the only one.
+                    self._open_home(tree.home)  # before the group is entered: this may fail
                     left.callback(self._return, tree.home)
                     _enter(path)
             yield group
 
+    def _open_home(self, home: str) -> None:
+        if home not in self._homes:
+            tasks = os.path.join(home, "tasks")
+            self._homes[home] = os.open(tasks, os.O_WRONLY | os.O_CLOEXEC)
+
     def _return(self, home: str) -> None:
-        """Move this thread back to its own group; only log an error: the instance has started."""
+        """Move this thread back to its own group, now or by `look`: the instance has started."""
         try:
-            if home not in self._homes:
-                tasks = os.path.join(home, "tasks")
-                self._homes[home] = os.open(tasks, os.O_WRONLY | os.O_CLOEXEC)
             os.write(self._homes[home], b"0")
+            self._left.pop(home, None)
         except OSError as error:
-            unusable = self._homes.pop(home, None)
-            if unusable is not None:
-                os.close(unusable)
+            os.close(self._homes.pop(home))  # the group may have been made again
+            self._left.setdefault(home, 0.0)
             own_log.write(f"the control group {home} cannot be entered again: {reason_of(error)}")
+
+    def _return_again(self, now: float) -> None:
+        for home, due in list(self._left.items()):
+            if due <= now:
+                self._left[home] = now + _RETURN_AGAIN
+                self._open_home(home)
+                self._return(home)
 
     def members(self, key: Key) -> list[int] | None:
         """Return the pids of all processes of an instance; None: it has no group.
@@ -267,15 +280,20 @@ class InstanceGroups:
             self._end(_path(tree, key), now)
 
     def look(self, now: float) -> None:
-        """Remove groups that could not be removed before; called in each round."""
+        """Leave and remove groups where that has failed before; called in each round.
+
+        Raises:
+            OSError: the supervisor's own group cannot be opened now; a later call tries again.
+        """
         for path, due in list(self._emptied.items()):
             if due <= now:
                 del self._emptied[path]
                 self._end(path, now)
+        self._return_again(now)
 
     def deadline(self) -> float | None:
-        """Return the time at which `look` is due; None: no group waits for its removal."""
-        return min(self._emptied.values(), default=None)
+        """Return the time at which `look` is due; None: it has nothing to do."""
+        return min((*self._emptied.values(), *self._left.values()), default=None)
 
     def close(self) -> None:
         """Remove the groups of all instances if no process is left."""

@@ -8,7 +8,9 @@ which detects their end by a pidfd, or by looking at /proc once a second if none
 
 from __future__ import annotations
 
+import contextlib
 import os
+import resource
 import selectors
 import signal
 from collections import deque
@@ -26,6 +28,8 @@ from rosrm.wording import signal_name
 
 #: In place of a pidfd: none can be had, and `look` finds the end of the process.
 _NO_PIDFD: Final = -1
+#: A child that has ended: pid, exit status and usage.
+Waited = tuple[int, int, resource.struct_rusage]
 #: Seconds between two looks at such processes.
 _LOOK_EVERY: Final = 1.0
 
@@ -65,6 +69,7 @@ class ProcessTrees:
         self._most_watched = descriptors.most_watched()
         self._adopted: dict[int, Key | None] = {}
         self._strays: dict[Key, dict[int, int]] = {}
+        self._waited: deque[Waited] = deque()  # ended children with unhandled exit statuses
         self._ends: deque[tuple[int, Exited]] = deque()  # of leaders, not reported yet
 
     # --- session leaders --------------------------------------------------------------------------
@@ -111,7 +116,7 @@ class ProcessTrees:
         Raises:
             OSError: the system has no room for a look; a later one continues.
         """
-        self._report_ends()
+        self._handle_waited()
         for key in [key for key, watched in self._strays.items() if not watched]:
             self._look_for_strays(key)
         if now < self._next_look or not self._looked_at:
@@ -125,7 +130,7 @@ class ProcessTrees:
 
     def deadline(self) -> float | None:
         """Return the time at which `look` has work; None: never."""
-        if self._ends or not all(self._strays.values()):
+        if self._waited or self._ends or not all(self._strays.values()):
             return 0.0
         return self._next_look if self._looked_at else None
 
@@ -163,16 +168,19 @@ class ProcessTrees:
 
     def reap(self) -> None:
         """Take the exit status of every child that has ended, and report the ends of leaders."""
-        while True:
-            try:
-                pid, status, usage = os.wait4(-1, os.WNOHANG)
-            except ChildProcessError:
-                break
-            if pid == 0:
-                break
+        with contextlib.suppress(ChildProcessError):
+            while (waited := os.wait4(-1, os.WNOHANG))[0]:
+                self._waited.append(waited)
+        self._handle_waited()
+
+    def _handle_waited(self) -> None:
+        """Report the ends of leaders; after a failure `look` continues, so no exit code is lost."""
+        while self._waited:
+            pid, status, usage = self._waited[0]
             self._adopted.pop(pid, None)
             if pid not in self._children:
                 self._reaped(pid)
+            self._waited.popleft()
             key = self._children.pop(pid, None)
             if key is not None:
                 code = os.waitstatus_to_exitcode(status)

@@ -72,17 +72,21 @@ class _Start:
     """A start whose process has not executed its program yet.
 
     Attributes:
+        steps: its further course.
         attempt: the process.
         birth: of the process, in clock ticks.
+        executes: pid of the process once it executes its program, until its end; 0: it does not.
         late: boot time from which the start counts as one that waits for a path.
         due: boot time at which the start fails.
     """
 
-    def __init__(self, key: Key, program: spawn.Program, log: int, steps: Steps[Confined]) -> None:
-        self.key, self.program, self.log, self.steps = key, program, log, steps
+    def __init__(self, key: Key, program: spawn.Program, log: int) -> None:
+        self.key, self.program, self.log = key, program, log
         self.late = clocks.boot_time() + LATE_START
         self.due = self.late - LATE_START + spawn.PATIENCE
         self.birth = 0
+        self.executes = 0
+        self.steps: Steps[Confined]
         self.attempt: spawn.Attempt
 
 
@@ -336,12 +340,8 @@ class Server:
                 self._spawn(key)
             except NoAnswer:
                 delayed.append(key)
-            except OSError as error:
-                self._spawn_failed(key, _no_room(error), transient=True)
             except Exception as fault:  # noqa: BLE001 - the core counts on an outcome of each
-                own_log.write_fault(f"the start of {mark(key)} failed")
-                failed = f"its start failed in the supervisor: {fault!r}"
-                self._spawn_failed(key, failed, is_transient(fault))
+                self._spawn_raised(key, fault)
         self._spawns.extendleft(reversed(delayed))
 
     def _late_disk(self) -> FileThread | None:
@@ -366,21 +366,20 @@ class Server:
             return
         if self._null < 0:
             self._null = _open_null()
-        try:
-            self._check_former_start(key)
-            program = self._program(launch)
-            log = self._open_log(key)
-        except SpawnError as error:
-            self._spawn_failed(key, str(error), error.transient)
-            return
+        self._check_former_start(key)
+        program = self._program(launch)
+        start = _Start(key, program, self._open_log(key))
+        watch = (self._selector, lambda: self._read_report(start))
 
         def begin(group: int, scheduler: spawn.Scheduler | None) -> spawn.Attempt:
             with score_of_children():
-                return spawn.begin(program, self._null, log, group=group, scheduler=scheduler)
+                return spawn.begin(
+                    program, self._null, start.log, group=group, scheduler=scheduler, watch=watch
+                )
 
         assert launch is not None
-        steps = self._confinement.start(key, launch.limits, begin)
-        self._advance(_Start(key, program, log, steps), lambda: next(steps))
+        start.steps = self._confinement.start(key, launch.limits, begin)
+        self._advance(start, lambda: next(start.steps))
 
     def _room_for_starts(self) -> int:
         """Return how many starts may begin, as each has a copy of this process before its exec.
@@ -408,22 +407,23 @@ class Server:
             start.attempt = step()
         except StopIteration as done:
             stamps = self._started(start, done.value)
-        except SpawnError as error:
-            self._spawn_failed(start.key, str(error), error.transient)
-        except OSError as error:
-            self._spawn_failed(start.key, _no_room(error), transient=True)
+        except Exception as fault:  # noqa: BLE001 - the core counts on an outcome
+            send(start.executes, signal.SIGKILL)
+            self._spawn_raised(start.key, fault)
         else:
             start.birth = birth
             self._starts[start.attempt.pid] = start
-            report = start.attempt.report
-            self._selector.register(report, selectors.EVENT_READ, lambda: self._read_report(start))
             return
         self._logs.close(start.log, stamps)
 
-    def _read_report(self, start: _Start) -> None:
-        """Read a part of the report of a start, and continue the start at the end of the report."""
+    def _read_report(self, start: _Start, *, lives: bool = True) -> None:
+        """Read a part of the report of a start, and continue the start at the end of the report.
+
+        `lives` is False for a process that was reaped: its pid may be another process's by now.
+        """
         if not start.attempt.read():
             return
+        pid = start.attempt.pid
         self._stop_watching(start)
         try:
             start.attempt.check()
@@ -431,11 +431,11 @@ class Server:
             fault = error
             self._advance(start, lambda: start.steps.throw(fault))
         else:
-            self._advance(start, lambda: start.steps.send(start.attempt.pid))
+            start.executes = pid if lives else 0
+            self._advance(start, lambda: start.steps.send(pid))
 
     def _stop_watching(self, start: _Start) -> None:
         del self._starts[start.attempt.pid]
-        self._selector.unregister(start.attempt.report)
         start.attempt.close()
 
     def _abandon(self, start: _Start) -> None:
@@ -458,28 +458,24 @@ class Server:
         """Note the end of a child that is no leader yet, and may have executed its program."""
         self._stuck.pop(pid, None)
         if pid in self._starts:
-            self._read_report(self._starts[pid])
+            self._read_report(self._starts[pid], lives=False)
 
     def _started(self, start: _Start, confined: Confined) -> str:
         """Report a start whose process executes its program; return the trace for its log."""
         key, (pid, enforced, note) = start.key, confined
+        self._trees.add_child(key, pid, start.birth)
         environment = start.program.environment
         stamps = ""
         if start_trace.VARIABLE in environment and not self._core.instances[key].started:
             traced = start_trace.stamped_in(environment, spawned=clocks.wall_time_ns())
             stamps = traced[start_trace.VARIABLE]
-        self._trees.add_child(key, pid, start.birth)
         self._logs.watch(key, clocks.boot_time(), pid)
         self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
         return stamps
 
     def _adopt(self, key: Key, launch: messages.Launch, rule: AdoptionRule) -> None:
         """Take over a process that runs, instead of the first start of an instance."""
-        try:
-            leader = adoption.check(rule, self._trees.owner_of)
-        except SpawnError as error:
-            self._spawn_failed(key, str(error), error.transient)
-            return
+        leader = adoption.check(rule, self._trees.owner_of)
         if not self._trees.take_over(key, leader):
             self._spawn_failed(key, adoption.ended(rule), transient=False)
             return
@@ -488,6 +484,18 @@ class Server:
         wanted = launch.limits.wanted
         note = f"adopted, so only its first restart applies {listed(wanted)}" if wanted else ""
         self._happened(Spawned(key, rule.pid, (), note, adopted=True))
+
+    def _spawn_raised(self, key: Key, fault: Exception) -> None:
+        """Report a start that an exception has ended."""
+        if isinstance(fault, SpawnError):
+            self._spawn_failed(key, str(fault), fault.transient)
+        elif isinstance(fault, OSError):
+            failed = f"it cannot be started now: {reason_of(fault)}"
+            self._spawn_failed(key, failed, transient=True)
+        else:
+            own_log.write_fault(f"the start of {mark(key)} failed")
+            failed = f"its start failed in the supervisor: {fault!r}"
+            self._spawn_failed(key, failed, is_transient(fault))
 
     def _spawn_failed(self, key: Key, reason: str, transient: bool) -> None:
         """Report a failure. All clients may read the reason, so STATE stands for the directory."""
@@ -779,10 +787,6 @@ def _guarded(call: Callable[..., None], *args: object) -> None:
     except Exception as fault:  # noqa: BLE001 - see above
         own_log.write_fault(f"a part of the loop failed: {fault}")
         time.sleep(PAUSE_AFTER_FAULT)
-
-
-def _no_room(error: OSError) -> str:
-    return f"it cannot be started now: {reason_of(error)}"
 
 
 def _open_null() -> int:

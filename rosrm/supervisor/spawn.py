@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import resource
+import selectors
 import signal
 import stat
 from collections.abc import Callable, Mapping
@@ -37,6 +38,8 @@ _REPORT: Final = 3
 
 #: Real-time policy and parameters of a process.
 Scheduler = tuple[int, os.sched_param]
+#: Selector that watches a report, and the function to call when the report is readable.
+Watch = tuple[selectors.BaseSelector, Callable[[], None]]
 
 
 class Program(NamedTuple):
@@ -62,16 +65,21 @@ class Program(NamedTuple):
 class Attempt:
     """A forked process, until it has become its program or has failed to.
 
+    Its report is watched before the process exists, so no process is left without a watcher.
+
     Attributes:
-        pid: of the process.
+        pid: of the process; 0: it does not exist yet.
         report: descriptor that is readable when `read` has something to do.
     """
 
-    def __init__(self, pid: int, report: int) -> None:
+    def __init__(self, report: int, watch: Watch | None) -> None:
         os.set_blocking(report, False)
-        self.pid = pid
+        self.pid = 0
         self.report = report
+        self._selector = watch[0] if watch else None
         self._told = b""
+        if watch:
+            watch[0].register(report, selectors.EVENT_READ, watch[1])
 
     def read(self) -> bool:
         """Read what the report has now; return True at its end."""
@@ -83,7 +91,9 @@ class Attempt:
         return True
 
     def close(self) -> None:
-        """Read no more of the report."""
+        """Read and watch the report no more."""
+        if self._selector is not None:
+            self._selector.unregister(self.report)
         os.close(self.report)
 
     @property
@@ -112,8 +122,9 @@ class Attempt:
 
 
 def begin(
-    program: Program, null: int, log: int, *, group: int = -1, scheduler: Scheduler | None = None
-) -> Attempt:
+    program: Program, null: int, log: int, *, group: int = -1, scheduler: Scheduler | None = None,
+    watch: Watch | None = None,
+) -> Attempt:  # fmt: skip
     """Fork a process that becomes a program.
 
     Args:
@@ -121,6 +132,7 @@ def begin(
         log: descriptor that becomes its standard output and error.
         group: descriptor of its control group of version 2; -1: that of this process.
         scheduler: None: that of this process.
+        watch: watches the report from before the fork until `Attempt.close`; None: the caller does.
 
     Raises:
         SpawnError: no process can be forked.
@@ -128,16 +140,19 @@ def begin(
     """
     report, told = os.pipe2(os.O_CLOEXEC)
     parent = os.getpid()
-    try:
-        pid, inside = _fork(group)
-        if not pid:
-            _become(program, (null, log, told), -1 if inside else group, scheduler, parent)
-    except BaseException:
-        os.close(report)
-        raise
-    finally:
-        os.close(told)
-    return Attempt(pid, report)
+    with contextlib.ExitStack() as undo:
+        undo.callback(os.close, report)
+        try:
+            attempt = Attempt(report, watch)
+            undo.pop_all()
+            undo.callback(attempt.close)
+            attempt.pid, inside = _fork(group)
+            if not attempt.pid:
+                _become(program, (null, log, told), -1 if inside else group, scheduler, parent)
+            undo.pop_all()  # from here on nothing fails: the process exists
+        finally:
+            os.close(told)
+    return attempt
 
 
 def _fork(group: int) -> tuple[int, bool]:
