@@ -245,9 +245,7 @@ def test_a_repeated_beat_is_dropped_before_its_signature_is_checked() -> None:
     assert follower.checked == 200
 
 
-@pytest.mark.xfail(
-    strict=False, reason="the control plane is on DDS: a signed message names no receiver"
-)
+@pytest.mark.xfail(reason="the control plane is on DDS: a signed message names no receiver")
 def test_a_recorded_beat_of_a_former_run_is_not_believed() -> None:
     """A member that has followed a run of the master believes no beat of an earlier run."""
     follower = Follower()
