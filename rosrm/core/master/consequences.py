@@ -14,7 +14,6 @@ def follow_up(state: MasterState, now: float) -> None:
     """Advance migrations and groups, and place what waits, after a change of the state."""
     executor.advance_all(state, now)
     cancel_groups(state, now)
-    state.admit_from_arrays()  # before the review, because these jobs may await other processes
     start_order.review(state, now)
     recall_gangs(state, now)
     place_waiting(state, now)

@@ -16,6 +16,7 @@ import numpy as np
 from rosrm.core.master.assignment.neighbours import locate
 from rosrm.core.master.graph_names import node_of
 from rosrm.core.master.master_state import MasterState, process_key, version_key
+from rosrm.core.master.state.arrays import array_of
 from rosrm.core.master.state.host_arrays import TIE, FloatArray
 from rosrm.core.master.state.pending_orders import (
     CapabilityQuery,
@@ -47,9 +48,8 @@ def check(state: MasterState) -> None:
 
 def places(state: MasterState) -> Iterator[str]:
     """Check that each process is in exactly one place, which matches its phase."""
-    held_back = list(state.queue.arrays)
-    queued = {*state.queue, *held_back}
-    if len(queued) != len(state.queue) + len(held_back):
+    queued = set(state.queue)
+    if len(queued) != len(list(state.queue)):
         yield "a process is in the queue twice"
     yield from _differs("queue", queued, _in_phase(state, ProcessPhase.QUEUED))
     yield from _differs("set_aside", state.set_aside, _in_phase(state, ProcessPhase.SET_ASIDE))
@@ -133,6 +133,18 @@ def declared(state: MasterState) -> Iterator[str]:
     for name, flows in state.flows.declared.items():
         if name in live and flows != live[name].spec.talks_to:
             yield f"flows has former flows of {name}"
+
+
+def arrays(state: MasterState) -> Iterator[str]:
+    """Check that exactly the jobs with an instance have the places of their arrays."""
+    taken = state.queue.arrays.taken
+    found = ((array, name) for array, names in taken.items() for name in names)
+    running = {
+        (array_of(one), name)
+        for name, one in state.processes.items()
+        if one.spec.array.name and one.instances
+    }
+    yield from _differs("arrays", found, running)
 
 
 def gangs(state: MasterState) -> Iterator[str]:
@@ -291,7 +303,7 @@ def _exists(state: MasterState, purpose: Purpose) -> bool:
 
 #: Every invariant.
 INVARIANTS: Final[tuple[Callable[[MasterState], Iterator[str]], ...]] = (
-    places, indices, declared, gangs, instances, specs, reservations, applications, ledger,
+    places, indices, declared, arrays, gangs, instances, specs, reservations, applications, ledger,
     orders,
 )  # fmt: skip
 

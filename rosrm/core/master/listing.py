@@ -9,6 +9,7 @@ from typing import Any, Final
 from rosrm.core.master.assignment.assign import decide_now
 from rosrm.core.master.assignment.flows import described_flows
 from rosrm.core.master.assignment.neighbours import awaited_neighbour
+from rosrm.core.master.assignment.places import why_no_place
 from rosrm.core.master.checkpoint import periodic
 from rosrm.core.master.checkpoint.image_requests import why_no_checkpoint, why_no_restore
 from rosrm.core.master.checkpoint.images import reason_of
@@ -128,13 +129,8 @@ def _reason_of_phase(state: MasterState, process: Process) -> str:
     """Return why a process is in its phase; "" for no reason."""
     if process.phase is ProcessPhase.SCHEDULED:
         return why_scheduled(state, process)
-    if process.name not in state.queue.arrays:
-        return reason_of(state, process)
-    taken = state.queue.arrays.taken(process)
-    running = sum(bool(state.processes[name].instances) for name in taken)
-    run = f"{running} of the array {process.spec.array.name} run already" if running else ""
-    next_ones = f"{len(taken) - running} of it are next" if len(taken) > running else ""
-    return ", and ".join(filter(None, (run, next_ones)))
+    awaits_place = process.name in state.queue and process.name not in state.queue.awaiting
+    return (awaits_place and why_no_place(state, process)) or reason_of(state, process)
 
 
 def _who_is_first(state: MasterState, process: Process) -> str:
@@ -150,7 +146,7 @@ def _first_before(state: MasterState, process: Process) -> str:
     head = state.queue.head()
     if head is not None and may_affect(state.processes[head], process):
         return head
-    for name in state.queue:
+    for name in state.queue.in_turn():
         if name not in state.queue.awaiting and may_affect(state.processes[name], process):
             return name
     return process.name
@@ -299,6 +295,8 @@ def _reason(state: MasterState, process: Process, row: ProcessRow) -> str:
         return state.neighbours.separated[process.name][0]
     if process.name in state.queue.awaiting:
         return process.reason
+    if process.name in state.queue and (full := why_no_place(state, process)):
+        return full
     if position and (awaited := awaited_neighbour(state, process)):
         return awaited
     made = state.preemption.room_made.get(process.name) if position else None

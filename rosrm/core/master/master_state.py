@@ -417,7 +417,7 @@ class MasterState:
 
     def set_spec(self, process: Process, spec: ProcessSpec) -> None:
         """Replace the spec of a process, and note what other parts of the state read of it."""
-        in_line = process.name in self.queue or process.name in self.queue.arrays
+        in_line = process.name in self.queue
         if in_line:
             self.unqueue(process)
         awaits_gang = process.awaits_gang
@@ -437,7 +437,7 @@ class MasterState:
         self._update_terminal(process)
         if in_line:
             self.put_in_queue(process)
-        self.queue.arrays.note_change(process)  # the bound of its array may be new
+        self.queue.note_places(process)
         self.start_orders.note_change(process.name)
         self.save(process)
 
@@ -489,23 +489,8 @@ class MasterState:
         self.put_in_queue(process)
 
     def put_in_queue(self, process: Process) -> None:
-        """Add a process whose phase is QUEUED to the queue, once its array has a place for it."""
-        if process.spec.array.parallel:
-            self.queue.arrays.add(process)
-        else:
-            self._put_in_queue(process)
-
-    def admit_from_arrays(self) -> None:
-        """Add the jobs to the queue for which their arrays have a place now."""
-        for name in self.queue.arrays.admitted(self._has_place):
-            self._put_in_queue(self.processes[name])
-
-    def _has_place(self, name: str) -> bool:
-        process = self.processes.get(name)
-        return process is not None and (name in self.queue or bool(process.instances))
-
-    def _put_in_queue(self, process: Process) -> None:
-        self.queue.add(process.name, process.spec.priority, process.order)
+        """Add a process whose phase is QUEUED to the queue."""
+        self.queue.add(process)
         self.start_orders.note_change(process.name)
         able = self.declared.capabilities_of(process.spec)
         if process.name in self.strays or isinstance(able, UnknownCapabilities):
@@ -517,7 +502,6 @@ class MasterState:
         """Remove the process from the queue and from the set-aside list."""
         if process.name in self.queue:
             self.queue.remove(process.name)
-        self.queue.arrays.remove(process)
         self.set_aside.discard(process.name)
 
     def names_of(self, application: str) -> list[str]:
@@ -681,7 +665,7 @@ class MasterState:
         self.neighbours.note_change(name)
         self.flows.note_change(name)
         if name in self.processes:
-            self.queue.arrays.note_change(self.processes[name])
+            self.queue.note_places(self.processes[name])
 
     def drop_instance(self, instance: Instance) -> None:
         """Remove an ended instance and its reservation."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -11,8 +13,11 @@ from rosrm.core.master import listing
 from rosrm.core.master.invariants import check
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.requester import Requester
-from rosrm.model.values import ProcessSpec, ReschedulePolicy
-from tests.unit.core.cluster import Cluster, Machine, job, process
+from rosrm.model.values import NeighbourRule, ProcessSpec, ReschedulePolicy, StartOrder
+from tests.unit.core.cluster import Cluster, Machine, job, node, process
+from tests.unit.core.test_gangs import machine
+
+ONE_RUNS = "1 of the array r runs already"
 
 
 def array(
@@ -58,12 +63,76 @@ def test_without_a_bound_all_jobs_run() -> None:
     assert len(running(cluster)) == 4
 
 
-def test_a_job_that_waits_for_a_host_has_a_place() -> None:
-    """The others say so."""
-    cluster = Cluster()
-    cluster.submit(*array(3))
-    assert cluster.queue() == ["r-1", "r-2"]
-    assert reason(cluster, "r-3") == "2 of it are next"
+def after(name: str) -> StartOrder:
+    return StartOrder({name: "ready"})
+
+
+WAITS: dict[str, dict[str, Any]] = {
+    "a process": {"start_order": after("slow")},
+    "a neighbour": {"neighbours": (NeighbourRule("near", ("late",)),)},
+    "its gang": {"together": "g"},
+    "the delay after a failure": {"reschedule": ReschedulePolicy(1, 100.0)},
+}
+
+
+@pytest.mark.parametrize("fields", WAITS.values(), ids=WAITS)
+def test_a_job_that_waits_for_something_else_holds_no_place(fields: dict[str, Any]) -> None:
+    """The next job has the place; the first one has it once it is free and the wait is over."""
+    cluster = Cluster("a", "b").with_processes(
+        node("slow"), process("late", start_order=after("slow")),
+        *array(1, 1, **fields), process("mate", together="g", start_order=after("slow")),
+    )  # fmt: skip
+    if cluster.where("r-1"):
+        cluster.finish("r-1", on=cluster.where("r-1")[0], code=1)
+    cluster.submit(*array(2, 1)[1:])
+    assert (cluster.where("r-1"), cluster.phase("r-2")) == ([], "running")
+    cluster.discover("slow", cluster.where("slow")[0])
+    cluster.wait(101.0)
+    assert (cluster.phase("r-1"), reason(cluster, "r-1")) == ("queued", ONE_RUNS)
+    cluster.finish("r-2", on=cluster.where("r-2")[0])
+    assert cluster.phase("r-1") == "running"
+
+
+def test_a_job_that_waits_for_a_host_holds_no_place() -> None:
+    """With backfill, the first job that fits has the place."""
+    cluster = Cluster(machine("a"), backfill=True).with_processes(process("p", memory=500))
+    cluster.submit(*array(1, 1, memory=500), *array(2, 1)[1:])
+    assert running(cluster) == ["p", "r-2"]
+    assert reason(cluster, "r-1") == ONE_RUNS
+    cluster.cancel("p", "r-2")
+    assert running(cluster) == ["r-1"]
+
+
+@pytest.mark.parametrize("backfill", [False, True])
+def test_a_gang_takes_all_of_its_places_at_once(backfill: bool) -> None:
+    """Without backfill, those behind it in the array do not take what it waits for."""
+    cluster = Cluster("a", backfill=backfill).with_processes(*array(1, 2))
+    cluster.submit(*array(3, 2, together="g")[1:], *array(4, 2)[3:], process("p"))
+    others = ["r-4"] if backfill else []
+    assert running(cluster) == ["p", "r-1", *others]
+    why = "and 2 of the gang g start at once"
+    for name in ("r-2", "r-3"):
+        assert reason(cluster, name).endswith(why)
+        assert cluster.explain(name)["reason"].endswith(why)
+    if not backfill:
+        assert reason(cluster, "r-4") == "a gang before it waits for places of the array r"
+    cluster.finish("r-1")
+    assert running(cluster) == (["p", "r-4"] if backfill else ["p", "r-2", "r-3"])
+    cluster.finish("r-4" if backfill else "r-2")
+    assert running(cluster) == (["p", "r-2", "r-3"] if backfill else ["p", "r-3", "r-4"])
+
+
+def test_no_process_makes_room_for_a_job_without_a_place() -> None:
+    """Of two jobs for one place, room is made for the first."""
+    cluster = Cluster(machine("a"), preemption="requeue", backfill=True, hysteresis=0.5)
+    cluster.submit(*(process(f"p{at}", memory=350) for at in (1, 2)))
+    cluster.submit(*array(1, 1, priority=5), *array(3, 1, memory=350, priority=5)[1:])
+    cluster.wait(5.0)
+    assert running(cluster) == ["p1", "p2", "r-1"]
+    cluster.finish("r-1")
+    cluster.wait(5.0)
+    assert len(cluster.recorded("preempted")) == 2  # one for each of both processes
+    assert [name for name in running(cluster) if name.startswith("r")] == ["r-2"]
 
 
 def test_a_waiting_job_can_be_cancelled_and_submitted_again() -> None:

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from math import inf
 
+from rosrm.core.master.assignment.gangs import members_of
+from rosrm.core.master.assignment.places import array_without_place
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.applications import Application, Task
 from rosrm.core.master.state.process import WAITING, Process, ProcessPhase
@@ -17,10 +19,12 @@ from rosrm.wording import duration
 
 def awaits_host(state: MasterState, process: Process) -> bool:
     """Return True if a process waits for a host, and for no other process."""
-    queue, name = state.queue, process.name
-    if process.phase not in WAITING or name in queue.arrays:
+    if process.phase not in WAITING:
         return False
-    return not any(member in queue.awaiting for member in (name, *state.gangs.of(process)))
+    gang = members_of(state, process)
+    if process.name in state.queue and array_without_place(state, process) is not None:
+        return False
+    return not any(one.name in state.queue.awaiting for one in gang)
 
 
 def note_wait(

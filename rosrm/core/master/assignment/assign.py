@@ -20,6 +20,11 @@ from rosrm.core.master.assignment.neighbours import (
     neighbours_of,
     waiting_with,
 )
+from rosrm.core.master.assignment.places import (
+    array_without_place,
+    reserve_places,
+    why_no_place,
+)
 from rosrm.core.master.checkpoint.replication import awaits_states
 from rosrm.core.master.commands import Assign
 from rosrm.core.master.dependants import note_restart
@@ -181,7 +186,8 @@ def held_back(state: MasterState, now: float) -> frozenset[str]:
     No process may be stopped to make room for them.
     """
     neighbours = _awaiting_neighbours(state, now)
-    return _with_gangs(state, _passed_over(state, now) | state.queue.awaiting | neighbours, now)
+    waiting = _passed_over(state, now) | state.queue.awaiting | neighbours
+    return _with_gangs(state, waiting, now).union(_without_places(state))
 
 
 def _place(state: MasterState, passed_over: frozenset[str], now: float) -> None:
@@ -267,9 +273,16 @@ def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
     return frozenset(found)
 
 
+def _without_places(state: MasterState) -> Iterator[str]:
+    """Yield the processes for which, or for whose gangs, an array has no place."""
+    if state.queue.has_bounds:
+        for name in state.queue:
+            if array_without_place(state, state.processes[name]) is not None:
+                yield name
+
+
 def _place_in_order(state: MasterState, passed_over: frozenset[str], now: float) -> None:
-    for name in _in_line(state, passed_over):
-        process = state.processes[name]
+    for process in _in_turn(state, passed_over, now):
         if not _place_or_set_aside(state, process, now):
             _place_past(state, process, passed_over, now)
             return
@@ -282,22 +295,31 @@ def _place_past(
     owners = {blocking.principal}
     if blocking.by_operator:
         return
-    for name in state.queue:
-        if name in passed_over or name not in state.queue:
-            continue
-        process = state.processes[name]
+    for process in _in_turn(state, passed_over, now):
         if process.principal not in owners and not _place_or_set_aside(state, process, now):
             if process.by_operator:
                 return
             owners.add(process.principal)
 
 
-def _in_line(state: MasterState, passed_over: frozenset[str]) -> Iterator[str]:
-    """Yield the waiting processes in order, while each one leaves the queue."""
-    if passed_over:  # of a gang, others than the first have left the queue with it
-        yield from (one for one in state.queue if one not in passed_over and one in state.queue)
-    while not passed_over and (name := state.queue.head()) is not None:
-        yield name  # faster, because thousands may wait
+def _in_turn(state: MasterState, passed_over: frozenset[str], now: float) -> Iterator[Process]:
+    """Yield the waiting processes in order that wait for a host alone.
+
+    Without backfill, a gang that waits for places of an array holds back those behind it in the
+    array, as one that waits for room holds back the queue; otherwise it might never have them all.
+    """
+    processes, has_bounds = state.processes, state.queue.has_bounds
+    state.queue.arrays.reserved.clear()
+    for name in state.queue.in_turn():
+        if name in passed_over:
+            continue
+        process = processes[name]
+        if not has_bounds or array_without_place(state, process) is None:
+            yield process
+        elif process.awaits_gang:
+            _record_wait_reason(state, process, why_no_place(state, process), now)
+            if not state.settings.backfill:
+                reserve_places(state, process)
 
 
 def _versions(state: MasterState) -> tuple[int, ...]:
@@ -311,10 +333,7 @@ def _versions(state: MasterState) -> tuple[int, ...]:
 
 def _place_any(state: MasterState, passed_over: frozenset[str], now: float) -> None:
     fit_nowhere = set[Hashable]()
-    for name in state.queue:
-        if name in passed_over or name not in state.queue:
-            continue
-        process = state.processes[name]
+    for process in _in_turn(state, passed_over, now):
         key = process.gang or demand_of(state, process).key
         if key not in fit_nowhere and not _place_or_set_aside(state, process, now):
             fit_nowhere.add(key)

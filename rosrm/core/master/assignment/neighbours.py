@@ -142,7 +142,9 @@ def _goes_first(state: MasterState, process: Process, name: str) -> bool:
 
 
 def _place_in_line(state: MasterState, process: Process) -> tuple[bool, int, int]:
-    return process.name in state.queue.awaiting, -process.spec.priority, process.order
+    queue, name = state.queue, process.name
+    is_passed_over = name in queue.awaiting or name in queue.delayed or not queue.position(name)
+    return is_passed_over, -process.spec.priority, process.order
 
 
 def _awaited_by(state: MasterState, name: str) -> dict[str, None]:

@@ -23,7 +23,7 @@ from rosrm.model.values import InstanceId, InstanceState, InstanceStatus
 
 def readopt_all(state: MasterState, host: Host, now: float) -> None:
     """Re-adopt every instance of a host without a successor, until the host reports otherwise."""
-    for name in [*state.queue, *state.queue.arrays, *sorted(state.set_aside)]:
+    for name in [*state.queue, *sorted(state.set_aside)]:
         process = state.processes[name]
         if process.left_behind is not None and process.left_behind.host == host.name:
             _readopt(state, process, process.left_behind, host, now)

@@ -15,6 +15,7 @@ A set is a union of groups: processes that must stay on one host leave it togeth
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
@@ -30,6 +31,7 @@ from rosrm.core.master.assignment.demands import demand_of, ranking_of
 from rosrm.core.master.assignment.gang_search import Blocked, find_places
 from rosrm.core.master.assignment.gangs import members_of
 from rosrm.core.master.assignment.neighbours import running_with
+from rosrm.core.master.assignment.places import array_without_place, wanted_places
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.eviction import PlannedMoves, begin_moves, plan_moves
 from rosrm.core.master.migration.room import (
@@ -47,6 +49,7 @@ from rosrm.core.master.rights import may_affect
 from rosrm.core.master.scheduling.candidates import candidates
 from rosrm.core.master.scheduling.filters import FILTERS, OF_ROOM, passing
 from rosrm.core.master.scheduling.ranking import Ranking
+from rosrm.core.master.state.arrays import ArrayKey
 from rosrm.core.master.state.backoff import Retries
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.master.state.hosts import Host
@@ -146,7 +149,7 @@ def _review_waiting(state: MasterState, now: float) -> None:
     made, held = state.preemption.room_made, held_back(state, now)
     claimed = [state.processes[name] for name, room in made.items() if room.host is not None]
     due = {one.name: one for one in (*claimed, *_waiting(state, held, now))}
-    for process in sorted(due.values(), key=lambda one: state.queue.position(one.name)):
+    for process in sorted(due.values(), key=lambda one: state.queue.key_of(one.name)):
         if process.name in held and now < made[process.name].deadline:
             continue  # its claim stands, but nothing more is stopped for it
         room = _review(state, process, made.pop(process.name, None), now)
@@ -174,8 +177,8 @@ def _waiting(state: MasterState, held: AbstractSet[str], now: float) -> Iterator
     """
     owners = (state.owned_by(one) for one in state.instances.values())
     lowest = min((one.spec.priority for one in owners if one is not None), default=inf)
-    found = 0
-    first: Process | None = None
+    found, first = 0, None
+    counted, places = set[object](), Counter[ArrayKey]()
     for name in state.queue:
         process = state.processes[name]
         if first is not None and (process.gang is None or process.gang != first.gang):
@@ -184,6 +187,11 @@ def _waiting(state: MasterState, held: AbstractSet[str], now: float) -> Iterator
             return
         if name in held:
             continue
+        if (process.gang or name) not in counted:
+            if array_without_place(state, process, places) is not None:
+                continue
+            counted.add(process.gang or name)
+            places += wanted_places(state, process)
         if now - process.since >= state.settings.hysteresis:
             yield process
         found += 1

@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Iterator
 from contextlib import contextmanager
+from heapq import merge
+from typing import Final
 
-from rosrm.core.master.state.arrays import ArrayPlaces
+from rosrm.core.master.state.arrays import ArrayKey, ArrayPlaces, QueueKey, array_of
+from rosrm.core.master.state.process import Process
 
-_Key = tuple[int, int, str]
+#: Array and bound of the jobs in a line; None: no bound.
+_Line = tuple[ArrayKey, int] | None
+#: Number of places of a line that are read at a time; thousands may wait behind a first one.
+_AT_ONCE: Final = 100
 
 
 class Queue:
     """Names of waiting processes in the order of their placement.
 
+    The jobs of each array with a bound are a line of their own, which is left out as a whole while
+    the array has no free place: thousands may wait there.
+
     Attributes:
         version: counter of changes.
         delayed: names in it that wait for the end of their delay.
-        arrays: jobs that wait outside of it, because their array has no place for them.
+        arrays: places of the arrays.
         awaiting: names in it that wait for other processes, or for an answer of their strategy.
     """
 
@@ -26,31 +35,38 @@ class Queue:
         self.delayed: set[str] = set()
         self.arrays = ArrayPlaces()
         self.awaiting: set[str] = set()
-        self._keys: list[_Key] = []
-        self._of: dict[str, _Key] = {}
+        self._lines: dict[_Line, list[QueueKey]] = {None: []}
+        self._of: dict[str, tuple[_Line, QueueKey]] = {}
 
-    def add(self, name: str, priority: int, order: int) -> None:
+    def add(self, process: Process) -> None:
         """Queue a process; a process that returns with its old `order` gets its old place."""
+        bound = process.spec.array.parallel
+        line = (array_of(process), bound) if bound else None
+        self._add(process.name, line, (-process.spec.priority, process.order, process.name))
+
+    def _add(self, name: str, line: _Line, key: QueueKey) -> None:
         if name in self._of:
             raise ValueError(f"{name} is in the queue already")
-        key = (-priority, order, name)
-        insort(self._keys, key)
+        insort(self._lines.setdefault(line, []), key)
         self.version += 1
-        self._of[name] = key
+        self._of[name] = line, key
 
     def remove(self, name: str) -> None:
         """Remove a process from any place."""
-        key = self._of.pop(name)
+        line, key = self._of.pop(name)
         self.delayed.discard(name)
         self.awaiting.discard(name)
-        del self._keys[bisect_left(self._keys, key)]
+        keys = self._lines[line]
+        del keys[bisect_left(keys, key)]
+        if line is not None and not keys:
+            del self._lines[line]
         self.version += 1
 
     @contextmanager
     def without(self, name: str) -> Iterator[None]:
         """Take a process out of the queue, if it is in it, until the end of the block."""
-        key = self._of.get(name)
-        if key is None:
+        found = self._of.get(name)
+        if found is None:
             yield
             return
         flags = [of for of in (self.delayed, self.awaiting) if name in of]
@@ -58,7 +74,7 @@ class Queue:
         try:
             yield
         finally:
-            self.add(name, -key[0], key[1])
+            self._add(name, *found)
             for of in flags:
                 of.add(name)
 
@@ -68,22 +84,66 @@ class Queue:
             self.awaiting.symmetric_difference_update({name})
             self.version += 1
 
+    def note_places(self, process: Process) -> None:
+        """Note that the instances or the array of a process have changed."""
+        self.version += self.arrays.note_change(process)
+
     def __contains__(self, name: str) -> bool:
         return name in self._of
 
     def __len__(self) -> int:
-        return len(self._keys)
+        return len(self._of)
 
     def __iter__(self) -> Iterator[str]:
-        return (name for _, _, name in list(self._keys))
+        return (name for _, _, name in list(merge(*self._lines.values())))
+
+    @property
+    def has_bounds(self) -> bool:
+        """Return True if a job of an array with a bound is in the queue."""
+        return len(self._lines) > 1
+
+    def in_turn(self) -> Iterator[str]:
+        """Return those in the queue in order; a line is left out, or its rest, once it is full.
+
+        The queue may lose processes on the way.
+        """
+        waiting, lines = self._of, [line for line in self._lines if self._is_open(line)]
+        keys = self._keys_of(None) if len(lines) == 1 else merge(*map(self._keys_of, lines))
+        return (name for _, _, name in keys if name in waiting)
 
     def head(self) -> str | None:
         """Return the process that is placed next; None: none waits only for its placement."""
-        if self.awaiting:
-            return next((name for _, _, name in self._keys if name not in self.awaiting), None)
-        return self._keys[0][2] if self._keys else None
+        awaiting, lines = self.awaiting, self._lines
+        open_ones = [lines[line] for line in lines if line is None or self._is_open(line)]
+        if awaiting:
+            firsts = (
+                next((key for key in keys if key[2] not in awaiting), None) for keys in open_ones
+            )
+            ready = [key for key in firsts if key is not None]
+        else:
+            ready = [keys[0] for keys in open_ones if keys]
+        return min(ready)[2] if ready else None
 
     def position(self, name: str) -> int:
-        """Return the place of a process; 1: head; 0: not in the queue."""
-        key = self._of.get(name)
-        return 0 if key is None else bisect_left(self._keys, key) + 1
+        """Return the place of a process; 1: head; 0: not in turn, because its array is full."""
+        line, key = self._of.get(name, (None, None))
+        if key is None or not self._is_open(line):
+            return 0
+        lines = (keys for one, keys in self._lines.items() if self._is_open(one))
+        return 1 + sum(bisect_left(keys, key) for keys in lines)
+
+    def key_of(self, name: str) -> QueueKey:
+        """Return the place of a queued process in the order."""
+        return self._of[name][1]
+
+    def _is_open(self, line: _Line) -> bool:
+        return line is None or self.arrays.are_free(*line)
+
+    def _keys_of(self, line: _Line) -> Iterator[QueueKey]:
+        keys, at = self._lines[line], 0
+        while chunk := keys[at : at + _AT_ONCE]:
+            for key in chunk:
+                if line is not None and not self._is_open(line):
+                    return
+                yield key
+            at = bisect_right(keys, chunk[-1])
