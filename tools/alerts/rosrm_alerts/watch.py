@@ -7,10 +7,12 @@ absent     the condition holds                                 pending
 pending    the condition does not hold                         absent
 pending    the condition has held for `lasts`                  active; the alert begins
 active     the condition does not hold                         absent; the alert ends
-any        the master does not answer                          unchanged, except `NoAnswer`
+any        the condition is unknown, as while the master       unchanged
+           does not answer, or without a fresh reading
 =========  ==================================================  =============================
 
-Each alert has these states for each host or process that its condition is about.
+Each alert has these states for each host or process that its condition is about. A host or process
+that is no longer listed is gone, so its alerts end.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from rosrm.wording import counted, duration
 from rosrm_alerts.conditions import (
     Above,
     Alert,
+    Condition,
     Happens,
     HostLost,
     InState,
@@ -81,6 +84,7 @@ class Watch:
         self._active = {key: at for key, at in (active or {}).items() if key[0] in names}
         self._since.update(self._active)
         self._times: dict[Key, deque[float]] = {}
+        self._observed = -inf
 
     @property
     def active(self) -> Mapping[Key, float]:
@@ -88,7 +92,10 @@ class Watch:
         return dict(self._active)
 
     def next_change(self) -> float:
-        """Return the earliest time at which an alert changes in an unchanged situation."""
+        """Return the earliest time at which an alert changes in an unchanged situation.
+
+        An alert that is due and has not begun waits for a situation in which its condition is known.
+        """
         lasts = {alert.name: alert.lasts for alert in self._alerts}
         pending = (at + lasts[key[0]] for key, at in self._since.items() if key not in self._active)
         within = {
@@ -96,7 +103,7 @@ class Watch:
             for alert in self._alerts if isinstance(alert.condition, Happens)
         }  # fmt: skip
         expiring = (times[0] + within[key[0]] for key, times in self._times.items() if times)
-        return min((*pending, *expiring), default=inf)
+        return min((at for at in (*pending, *expiring) if at > self._observed), default=inf)
 
     def observe(
         self, now: float, situation: Situation | None, events: Iterable[SeenEvent] = ()
@@ -108,7 +115,7 @@ class Watch:
             situation: None: the master does not answer.
             events: events since the last call, the oldest first.
         """
-        happened = list(events)
+        happened, self._observed = list(events), now
         return [
             change
             for alert in self._alerts
@@ -121,10 +128,10 @@ class Watch:
 
     def _compared(self, alert: Alert, now: float, situation: Situation | None) -> Iterator[Change]:
         """Yield the changes of an alert whose condition is a state of the cluster."""
-        if situation is None and not isinstance(alert.condition, NoAnswer):
-            return
         holds = _holding(alert, situation)
         for key in [key for key in self._since if key[0] == alert.name and key[1] not in holds]:
+            if _is_unknown(alert.condition, key[1], situation):
+                continue
             del self._since[key]
             if self._active.pop(key, None) is not None:
                 yield Change(alert, key[1], "ends", now, f"{_end(alert, key[1])}")
@@ -213,6 +220,20 @@ def _holding(alert: Alert, situation: Situation | None) -> dict[Subject, str]:
             and fnmatchcase(seen.application, condition.application)
         }
     return {}
+
+
+def _is_unknown(condition: Condition, subject: Subject, situation: Situation | None) -> bool:
+    """Return True if the cluster does not tell whether a condition holds for a subject."""
+    if isinstance(condition, NoAnswer):
+        return False
+    if situation is None:
+        return True
+    host, process = situation.hosts.get(subject.host), situation.processes.get(subject.process)
+    if isinstance(condition, Above):
+        return host is not None and condition.resource not in host.resources
+    if isinstance(condition, HostLost):
+        return host is not None and host.state == "expected"
+    return process is not None and process.state == "unknown"
 
 
 def _above(condition: Above, situation: Situation) -> Iterator[tuple[Subject, str]]:

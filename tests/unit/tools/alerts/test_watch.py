@@ -2,6 +2,7 @@
 
 from math import inf
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,11 +22,20 @@ from rosrm_alerts.conditions import (
 from rosrm_alerts.watch import Subject, Watch
 
 HOT = Alert("hot", Above("memory", 0.9), lasts=30.0)
+RUNS = InState(frozenset({"running"}))
 AT_REST = Situation({"h1": SeenHost()})
 
 
-def usage(share: float, limit: float = 1.0, host: str = "h1") -> Situation:
-    return Situation({host: SeenHost("up", {"memory": SeenResource(share, limit)})})
+def usage(share: float, limit: float = 1.0, name: str = "h1") -> Situation:
+    return Situation({name: SeenHost("up", {"memory": SeenResource(share, limit)})})
+
+
+def host(state: str) -> Situation:
+    return Situation({"h1": SeenHost(state)})
+
+
+def process(state: str) -> Situation:
+    return Situation(processes={"p": SeenProcess(state)})
 
 
 def told(changes) -> list[tuple[str, str, str]]:
@@ -67,12 +77,37 @@ def test_a_silent_master_changes_no_alert_but_its_own():
     assert told(watch.observe(32.0, usage(0.95))) == [("silent", "ends", "the cluster")]
 
 
-def test_a_host_that_is_gone_ends_its_alert():
-    """A pruned host, or a stale reading, is not above a limit."""
-    watch = Watch([Alert("hot", Above("memory"))])
+@pytest.mark.parametrize(
+    ("condition", "holds", "unknown", "over"),
+    [
+        (Above("memory"), usage(0.81, 0.8), AT_REST, usage(0.7)),
+        (Above("memory"), usage(0.81, 0.8), AT_REST, Situation()),
+        (HostLost(), host("lost"), host("expected"), host("up")),
+        (HostLost(), host("lost"), host("expected"), Situation()),
+        (RUNS, process("running"), process("unknown"), process("queued")),
+        (RUNS, process("running"), process("unknown"), Situation()),
+    ],
+)
+def test_an_alert_ends_only_once_its_condition_is_known(condition, holds, unknown, over):
+    """A stale reading, or a silent host, tells nothing. What is no longer listed is gone."""
+    watch = Watch([Alert("seen", condition)])
+    ((_, begins, of),) = told(watch.observe(0.0, holds))
 
-    assert told(watch.observe(0.0, usage(0.81, limit=0.8))) == [("hot", "begins", "h1")]
-    assert told(watch.observe(1.0, AT_REST)) == [("hot", "ends", "h1")]
+    assert begins == "begins"
+    assert told(watch.observe(1.0, unknown)) == []
+    assert told(watch.observe(2.0, holds)) == []
+    assert told(watch.observe(3.0, unknown)) == []
+    assert told(watch.observe(4.0, over)) == [("seen", "ends", of)]
+
+
+def test_an_alert_that_is_due_while_nothing_is_known_begins_later():
+    """A test of alerts advances to the next change, and must not wait for this one for ever."""
+    watch = Watch([HOT])
+    watch.observe(0.0, usage(0.95))
+
+    assert told(watch.observe(30.0, None)) == []
+    assert watch.next_change() == inf
+    assert told(watch.observe(40.0, usage(0.95))) == [("hot", "begins", "h1")]
 
 
 def test_conditions_choose_by_patterns():
