@@ -1,10 +1,10 @@
-"""Errors that tell what the machine or this process lacks now, not what a file or process is.
+"""Public. Errors of a look at a file or process: which tell that it does not exist, and which not.
 
-Code that took one of them for "it does not exist" ended a process that runs, or deleted the only
+Code that took another one for "it does not exist" ended a process that runs, or deleted the only
 copy of a state.
 
-`os.path.exists` and its kin, and from Python 3.14 on those of `pathlib`, are False after any error.
-The functions here are False only for what certainly does not exist.
+`os.path.exists` and its kin, and from Python 3.14 on those of `pathlib` with `glob`, are False or
+empty after any error. The functions here are so only for what certainly does not exist.
 """
 
 from __future__ import annotations
@@ -12,17 +12,29 @@ from __future__ import annotations
 import errno
 import os
 import stat
+from collections.abc import Iterator
 from typing import Final
+
+__all__ = [
+    "ABSENT", "SHORTAGE", "exists", "is_directory", "is_file", "names", "raise_shortage",
+    "raise_unless_absent", "status", "tree",
+]  # fmt: skip
 
 #: No room for another open file, or no memory.
 SHORTAGE: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
-#: Nothing has this path.
-_ABSENT: Final = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ELOOP})
+#: Nothing has this path, or a device file has no device.
+ABSENT: Final = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENODEV, errno.ENXIO})
 
 
 def raise_shortage(error: OSError) -> None:
     """Raise an error that is a shortage; any other one tells something about the file."""
     if error.errno in SHORTAGE:
+        raise error
+
+
+def raise_unless_absent(error: OSError) -> None:
+    """Raise an error unless the file, or the process of a file in /proc, does not exist."""
+    if error.errno not in (*ABSENT, errno.ESRCH):
         raise error
 
 
@@ -35,7 +47,7 @@ def status(path: str | os.PathLike[str], *, follow_symlinks: bool = True) -> os.
     try:
         return os.stat(path, follow_symlinks=follow_symlinks)  # noqa: PTH116 - without pathlib
     except OSError as error:
-        if error.errno in _ABSENT:
+        if error.errno in ABSENT:
             return None
         raise
     except ValueError:  # a NUL byte in the path, or a character that has no bytes
@@ -57,3 +69,26 @@ def is_file(path: str | os.PathLike[str]) -> bool:
     """Return True for a regular file, or a link to one; raises `OSError` as `status`."""
     found = status(path)
     return found is not None and stat.S_ISREG(found.st_mode)
+
+
+def names(directory: str | os.PathLike[str]) -> list[str]:
+    """Return the names in a directory, in any order; [] if it does not exist.
+
+    Raises:
+        OSError: it may exist, but cannot be listed now.
+    """
+    try:
+        return os.listdir(directory)  # noqa: PTH208 - as above
+    except OSError as error:
+        raise_unless_absent(error)
+        return []
+
+
+def tree(directory: str | os.PathLike[str]) -> Iterator[str]:
+    """Yield the paths of all that is below a directory, without following links; as `names`."""
+    for name in names(directory):
+        path = f"{os.fspath(directory)}/{name}"
+        yield path
+        found = status(path, follow_symlinks=False)
+        if found is not None and stat.S_ISDIR(found.st_mode):
+            yield from tree(path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
@@ -16,6 +15,7 @@ from rosrm.errors import describe_fault
 from rosrm.model.devices import MOST_DEVICES, Device
 from rosrm.runtime.path_calls import PathCall, RunPath
 from rosrm.runtime.path_calls import at as touching
+from rosrm.shortage import raise_unless_absent
 from rosrm.slave.sampler import Finding
 from rosrm.wording import listed, reason_of, sanitized
 
@@ -25,9 +25,6 @@ _log = logging.getLogger("rosrm.slave")
 LOOK_PERIOD: Final = 1.0
 #: Least seconds between the two measurements after which a missing device is lost.
 _LASTS: Final = 0.9 * LOOK_PERIOD
-
-#: Errors of a file that is not there. After any other error, the look was not made.
-_ABSENT: Final = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ENODEV, errno.ENXIO})
 
 #: A device, and when it was measured; None: it is not known to be missing.
 _Measured = tuple[Device, float | None]
@@ -47,8 +44,7 @@ def file_fault(path: str) -> str:
         touching(path)
         Path(path).stat()
     except OSError as error:
-        if error.errno not in _ABSENT:
-            raise
+        raise_unless_absent(error)
         return f"{path}: {reason_of(error)}"
     return ""
 

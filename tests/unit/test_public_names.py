@@ -12,16 +12,14 @@ from pathlib import Path
 import pytest
 
 import rosrm
+from rosrm import shortage
 from tests.pages import PYTHON, ROOT, blocks, run_examples
 
 #: Modules with public names of their own.
-PUBLIC = ("rosrm.node", "rosrm.testing")
+PUBLIC = ("rosrm.node", "rosrm.shortage", "rosrm.testing")
 #: Programs of this repository that need more names.
 MORE = {
-    "plugins/container/rosrm_container/podman.py": {"rosrm.shortage"},
     "plugins/migration/rosrm_migration/handoff.py": {"rosrm.ros.slave.publisher_watch"},
-    "plugins/resources/rosrm_resources/cgroups.py": {"rosrm.shortage"},
-    "plugins/resources/rosrm_resources/cpu.py": {"rosrm.shortage"},
     "examples/rosrm_examples/demo_job.py": {"rosrm.config.settings"},
     "examples/rosrm_examples/demo_run.py": {"rosrm.supervisor.client"},
     "examples/rosrm_examples/demo_screen.py": {"rosrm.cli.output.top"},
@@ -49,7 +47,6 @@ OF_CRIU = {
     "rosrm.runtime.disk_space",
     "rosrm.runtime.log_tail",
     "rosrm.runtime.signalling",
-    "rosrm.shortage",
     "rosrm.supervisor",
     "rosrm.supervisor.procfs",
     "rosrm.supervisor.spawn",
@@ -165,6 +162,14 @@ def test_the_page_has_every_public_name_and_no_other():
     cells = re.findall(r"^\| (`[^|]*`) \|", text, re.MULTILINE)
     named = [name for cell in cells for name in re.findall(r"`(\w+)`", cell)]
     assert sorted(named) == sorted(rosrm.__all__)
+
+
+def test_the_page_has_every_name_of_the_shortage():
+    text = (ROOT / PYTHON).read_text(encoding="utf-8").partition("\n## All names\n")[0]
+    table = text.partition("\n## Looks at files\n")[2]
+    cells = re.findall(r"^\| (`[^|]*`) \|", table, re.MULTILINE)
+    named = [name for cell in cells for name in re.findall(r"`(\w+)", cell)]
+    assert sorted(named) == sorted(shortage.__all__)
 
 
 def test_the_page_has_every_method_and_argument_of_the_client():

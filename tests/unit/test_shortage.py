@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from rosrm.shortage import exists, is_directory, is_file, status
+from rosrm.shortage import exists, is_directory, is_file, names, status, tree
 
 ROOT = Path(__file__).resolve().parents[2]
 #: Parts that end, delete, overwrite or restart something where a file does not exist.
-PARTS = ("supervisor", "slave")
+PARTS = ("rosrm/supervisor", "rosrm/slave", "plugins")
 #: Texts alone depend on it here.
 TEXTS = {ROOT / "rosrm/supervisor/exec_failures.py"}
 #: Functions of `os.path`, and methods of `pathlib.Path`, that are False after any error.
@@ -55,6 +55,15 @@ def test_what_is_there_is_told_by_its_kind(tmp_path):
     assert status(tmp_path / "link", follow_symlinks=False) is not None
 
 
+def test_a_directory_has_names_and_a_tree(tmp_path):
+    (tmp_path / "a/b").mkdir(parents=True)
+    (tmp_path / "a/b/c").touch()
+    (tmp_path / "a/up").symlink_to("..")
+    assert names(tmp_path) == ["a"]
+    assert names(tmp_path / "none") == []
+    assert sorted(tree(tmp_path)) == [f"{tmp_path}/{one}" for one in ("a", "a/b", "a/b/c", "a/up")]
+
+
 def test_what_no_path_can_name_is_absent(tmp_path):
     (tmp_path / "file").touch()
     (tmp_path / "loop").symlink_to("loop")
@@ -63,22 +72,23 @@ def test_what_no_path_can_name_is_absent(tmp_path):
 
 
 @pytest.mark.parametrize("number", [errno.ENOMEM, errno.EACCES, errno.EIO, errno.ESTALE])
-@pytest.mark.parametrize("ask", [exists, is_directory, is_file])
+@pytest.mark.parametrize("ask", [exists, is_directory, is_file, names])
 def test_any_other_error_is_no_absence(tmp_path, monkeypatch, number, ask):
     def fail(*_, **__):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(os, "stat", fail)
+    monkeypatch.setattr(os, "listdir", fail)
     with pytest.raises(OSError, match=os.strerror(number)):
         ask(tmp_path)
 
 
-def test_supervisor_and_slave_take_no_error_for_an_absence():
+def test_no_part_takes_an_error_for_an_absence():
     """They ask `rosrm.shortage`, or call the file and expect FileNotFoundError."""
     found = {
         f"{path.relative_to(ROOT)}:{node.lineno}: {node.func.attr}"
         for part in PARTS
-        for path in sorted((ROOT / "rosrm" / part).rglob("*.py"))
+        for path in sorted((ROOT / part).rglob("*.py"))
         if path not in TEXTS
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)

@@ -30,7 +30,7 @@ def main(argv: list[str]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # a stop during the start needs no traceback
     program, own = argv[0], Path(_option(argv, "--pidfile="))
     own.unlink(missing_ok=True)  # of an earlier start
-    files = [one for ending in ("*.pid", "*.key") for one in own.parent.glob(ending)]
+    files = [one for one in own.parent.iterdir() if one.suffix in (".pid", ".key")]
     listed = set(_listed(program, _option(argv, "--label=")))
     running = set(_running())  # read last, because another container may start at this moment
     for file in files:
@@ -72,9 +72,9 @@ def _running() -> Iterator[str]:
     Raises:
         OSError: a process cannot be looked at; its container is not to be removed for that.
     """
-    for file in Path("/proc").glob("[0-9]*/cmdline"):
+    for pid in filter(str.isdigit, os.listdir("/proc")):  # noqa: PTH208 - of names
         try:
-            words = file.read_bytes().split(b"\0")
+            words = Path("/proc", pid, "cmdline").read_bytes().split(b"\0")
         except (FileNotFoundError, ProcessLookupError, PermissionError):  # ended, or of another
             continue
         names = (word for word in words if word.startswith(b"--name=rosrm-"))

@@ -15,7 +15,7 @@ from typing import Final
 from rosrm import InstanceId, Launch, LauncherContext, ProcessSpec, options_of
 from rosrm.errors import CriuError, LaunchError, PortableError
 from rosrm.ros.names import token
-from rosrm.shortage import raise_shortage
+from rosrm.shortage import exists, raise_shortage
 from rosrm.supervisor.spawn import find_executable
 from rosrm.supervisor.spawn_error import SpawnError
 from rosrm_criu.control.client import directory_of, make_control_root
@@ -39,7 +39,7 @@ class CriuLauncher:
         spec, instance = launch.assignment.spec, launch.assignment.instance
         restored, portable = launch.assignment.restored, _is_portable(spec)
         incoming = paths.incoming(self._state, instance.number)
-        if restored and not portable and not incoming.exists():
+        if restored and not portable and not exists(incoming):
             return None
         environment, argv = dict(launch.environment), launch.argv
         if portable and VARIABLE not in spec.environment:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rosrm import ConfigError
-from rosrm.shortage import raise_shortage
+from rosrm.shortage import is_directory, raise_shortage
 
 
 @dataclass(frozen=True)
@@ -159,6 +159,6 @@ def _below(mount: _Mount, path: str) -> Path:
     parts = [part for part in path.split("/") if part]
     if ".." in parts:  # a group above the root of our namespace is not visible
         parts = []
-    while parts and not mount.point.joinpath(*parts).is_dir():
+    while parts and not is_directory(mount.point.joinpath(*parts)):
         parts.pop()
     return mount.point.joinpath(*parts)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm import PositiveSeconds, ProbeContext, Sessions
-from rosrm.shortage import raise_shortage
+from rosrm.shortage import exists, is_directory, raise_shortage
 from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
@@ -189,9 +189,9 @@ class GroupTime:
             return
         # In version 1 another controller counts the time, and it may be mounted elsewhere.
         account = find_group("cpuacct", root)
-        if account is not None and not (directory / "cpuacct.usage").exists():
+        if account is not None and not exists(directory / "cpuacct.usage"):
             same = account.mount / directory.relative_to(group.mount)
-            directory = same if same.exists() else account.directory
+            directory = same if exists(same) else account.directory
         self._file = OpenFile(directory / "cpuacct.usage", 64)
 
     def seconds(self) -> float:
@@ -259,7 +259,7 @@ def _cpu_set(group: Group, root: Path) -> tuple[Path, float] | None:
     if not own:
         return None
     same = group.mount / top.relative_to(sets.mount)
-    return (same if same.is_dir() else group.directory), float(own)
+    return (same if is_directory(same) else group.directory), float(own)
 
 
 class SliceCpu:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm import PositiveSeconds, ProbeContext, Sessions
+from rosrm.shortage import exists
 from rosrm_resources.cgroups import lines_of
 from rosrm_resources.gauge import GaugeProbe, Scope, budget
 
@@ -77,7 +78,7 @@ class FileSystem:
 
     def __init__(self, path: Path) -> None:
         path = path.absolute()
-        while not path.exists():
+        while not exists(path):
             path = path.parent
         self.path: Final = path
         self._path = str(path)

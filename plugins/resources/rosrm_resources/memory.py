@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm import ProbeContext, Sessions
+from rosrm.shortage import exists
 from rosrm_resources.cgroups import Group, find_group, read_number
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
@@ -73,7 +74,7 @@ class MachineMemory:
     def __init__(self, proc: Path = Path("/proc")) -> None:
         self._file = OpenFile(proc / "meminfo", 256)
         arc = proc / "spl/kstat/zfs/arcstats"
-        self._arc = OpenFile(arc, 1 << 14) if arc.exists() else None
+        self._arc = OpenFile(arc, 1 << 14) if exists(arc) else None
         self.capacity: Final = self._bytes(b"MemTotal:")
 
     def usage(self) -> float:

@@ -16,6 +16,7 @@ from rosrm import (
     ResourceDescription,
     SkipPlugin,
 )
+from rosrm.shortage import exists
 from rosrm_resources.rate import Rate, check_window
 
 _BYTES_PER_MEGABIT: Final = 1e6 / 8
@@ -121,7 +122,7 @@ def links(options: NetworkOptions, classes: Path = Path("/sys/class/net")) -> di
     chosen = options.interfaces or tuple(
         name
         for name, state in statistics.items()
-        if state.isup and (classes / name / "device").exists()
+        if state.isup and exists(classes / name / "device")
     )
     if not chosen:
         raise SkipPlugin("no physical network interface is up")

@@ -94,7 +94,7 @@ class Watch:
     def next_change(self) -> float:
         """Return the earliest time at which an alert changes in an unchanged situation.
 
-        An alert that is due and has not begun waits for a situation in which its condition is known.
+        An alert that is due but has not begun waits until its condition is known.
         """
         lasts = {alert.name: alert.lasts for alert in self._alerts}
         pending = (at + lasts[key[0]] for key, at in self._since.items() if key not in self._active)

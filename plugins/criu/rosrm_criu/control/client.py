@@ -14,6 +14,7 @@ from typing import Final
 from rosrm import clocks
 from rosrm.errors import PortableError
 from rosrm.runtime.signalling import send
+from rosrm.shortage import is_directory
 from rosrm.supervisor.procfs import read_environment
 from rosrm.wording import reason_of
 from rosrm_criu.control.directory import make
@@ -64,7 +65,7 @@ def make_control_root(uid: int) -> Path:
     """
     faults = []
     for root in control_roots(uid):
-        if root.is_relative_to(_SERVICE) and not _SERVICE.is_dir():
+        if root.is_relative_to(_SERVICE) and not is_directory(_SERVICE):
             continue
         try:
             make(root, uid)

@@ -23,6 +23,7 @@ from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm.runtime.log_tail import last_lines
 from rosrm.runtime.signalling import send_to_group
+from rosrm.shortage import exists
 from rosrm.wording import ending_of, reason_of
 from rosrm_criu.engine.criu_log import causes, first_words
 
@@ -133,7 +134,7 @@ def find(prefix: Path | None = None) -> CriuBinary:
     in_path = shutil.which("criu", path=f"{os.environ.get('PATH', '')}:{_PLACES}")
     broken = []
     for place in (private, Path(in_path) if in_path else None):
-        if place is not None and place.exists():
+        if place is not None and exists(place):
             try:
                 return opened(place)
             except CriuError as error:
@@ -160,7 +161,7 @@ def opened(program: Path) -> CriuBinary:
         )
     except OSError as error:
         why = reason_of(error)
-        if isinstance(error, FileNotFoundError) and program.exists():
+        if isinstance(error, FileNotFoundError) and exists(program):
             why = "the C library that it names is missing; if CRIU was moved, install it again"
         raise CriuError(f"{program} cannot be started: {why}") from None
     except subprocess.TimeoutExpired:

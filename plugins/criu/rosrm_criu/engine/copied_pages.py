@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rosrm.errors import CriuError
+from rosrm.shortage import is_directory, is_file, names
 from rosrm_criu.engine import protobuf
 from rosrm_criu.engine.image import GRANDPARENT, PARENT
 from rosrm_criu.engine.memory_copy import (
@@ -186,15 +187,17 @@ def move_into_parent(directory: Path, copies: Path) -> None:
 
     The copies of processes without pages in the parent stay: small ones, and those that have ended.
     """
-    sources = [copies / CHANGES, copies] if (directory / GRANDPARENT).is_dir() else [copies]
+    sources = [copies / CHANGES, copies] if is_directory(directory / GRANDPARENT) else [copies]
     for source, folder in zip(sources, (PARENT, GRANDPARENT), strict=False):
-        for pagemap in (directory / folder).glob("pagemap-*.img"):
-            name = pagemap.name.replace("pagemap", "pages")
+        for pagemap in names(directory / folder):
+            if not (pagemap.startswith("pagemap-") and pagemap.endswith(".img")):
+                continue
+            name = pagemap.replace("pagemap", "pages")
             (source / name).rename(directory / folder / name)
 
 
 def check_files(directory: Path) -> None:
     """Raise CriuError if a received directory contains anything but copied pages."""
     for path in directory.iterdir():
-        if not (path.is_file() and _COPY.fullmatch(path.name)):
+        if not (is_file(path) and _COPY.fullmatch(path.name)):
             raise CriuError("the copy contains other files than pages-PID.img: refused")

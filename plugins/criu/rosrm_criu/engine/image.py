@@ -22,6 +22,7 @@ from typing import Any, Final
 
 from rosrm.errors import CriuError
 from rosrm.model.codec import from_plain, to_plain
+from rosrm.shortage import is_file, tree
 from rosrm.wording import reason_of
 
 #: The format that is written. Only this one and its predecessor can be read.
@@ -164,9 +165,9 @@ def check_room(directory: Path, needed: int) -> None:
 def file_sizes(directory: Path) -> dict[str, int]:
     """Return the bytes of each file of an image by relative path; set each mode to 0600."""
     sizes = {}
-    for path in sorted(directory.rglob("*")):
+    for path in sorted(map(Path, tree(directory))):
         name = path.relative_to(directory).as_posix()
-        if path.is_file() and name.startswith((f"{PAGES}/", f"{COPIES}/")):
+        if is_file(path) and name.startswith((f"{PAGES}/", f"{COPIES}/")):
             path.chmod(0o600)
             sizes[name] = path.stat().st_size
     return sizes

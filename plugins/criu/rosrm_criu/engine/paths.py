@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 import rosrm
+from rosrm.shortage import names
 
 
 def folder_of_rosrm() -> str:
@@ -54,5 +55,5 @@ ImageKind = Literal["out", "in", "kept", "periodic", "copy-out", "copy-in"]
 
 def numbers(state: Path, kind: ImageKind) -> list[int]:
     """Return the numbers of the instances that have an image of a kind."""
-    found = [path.name.removeprefix(f"{kind}-") for path in (state / "images").glob(f"{kind}-*")]
-    return sorted(int(number) for number in found if number.isdigit())
+    parts = (name.rpartition("-") for name in names(state / "images"))
+    return sorted(int(number) for found, _, number in parts if found == kind and number.isdigit())

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm.shortage import exists
 from rosrm.wording import reason_of
 from rosrm_criu.engine import image
 from rosrm_criu.engine.image import HeldFile, Manifest, MappedFile
@@ -71,7 +72,7 @@ def prepare(directory: Path, manifest: Manifest) -> None:
     """
     image.check_contents(directory, manifest)
     for mapped in manifest.mapped:
-        if is_tracing(mapped.path) and not Path(mapped.path).exists():
+        if is_tracing(mapped.path) and not exists(mapped.path):
             _make_tracing_file(mapped)
     for held in manifest.files:
         try:
@@ -94,7 +95,7 @@ def _put_back(directory: Path, held: HeldFile, working_directory: str) -> None:
         parts = parts_below(held.path, working_directory)
         with _folder(working_directory, parts[:-1]) as folder:
             _replace(directory / held.copy, folder, parts[-1], held.mode)
-    elif held.grows and not Path(held.path).exists():
+    elif held.grows and not exists(held.path):
         parts = parts_below(held.path, "/")
         with _folder("/", parts[:-1]) as folder:
             os.close(os.open(parts[-1], _NEW, held.mode & _PERMISSIONS, dir_fd=folder))

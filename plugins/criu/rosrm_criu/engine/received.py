@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm.shortage import tree
 from rosrm_criu.engine import image, protobuf, restore
 from rosrm_criu.engine.image import Manifest
 from rosrm_criu.engine.put_back import is_tracing, parts_below
@@ -72,8 +73,8 @@ def check(directory: Path, *, state: Path, working_directory: str | None, uid: i
 
 def _check_names(directory: Path, manifest: Manifest) -> None:
     expected = {*manifest.sizes, image.MANIFEST, image.DUMP_LOG}
-    for path in directory.rglob("*"):
-        name = path.relative_to(directory).as_posix()
+    for path in tree(directory):
+        name = os.path.relpath(path, directory)
         if name not in expected and name not in _FOLDERS:
             raise CriuError(f"the image holds {name!r}, which its manifest does not name: refused")
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm.shortage import raise_shortage
+from rosrm.shortage import is_directory, is_file, raise_shortage
 from rosrm.supervisor import paths
 from rosrm.supervisor.procfs import SUPERVISOR_MARK
 from rosrm.wording import reason_of
@@ -57,12 +57,12 @@ def check(manifest: Manifest) -> None:
     here = platform.node()
     if manifest.machine != platform.machine():
         raise CriuError(f"the image was made on {manifest.machine}; {here} is {platform.machine()}")
-    if not Path(manifest.working_directory).is_dir():
+    if not is_directory(manifest.working_directory):
         raise CriuError(
             f"the working directory {manifest.working_directory} of the process is missing on "
             f"{here}: make it, or give the process a `working_directory` that every host has"
         )
-    if not Path(manifest.interpreter).is_file():
+    if not is_file(manifest.interpreter):
         raise CriuError(f"the program {manifest.interpreter} of the process is missing on {here}")
     for held in manifest.files:
         if not held.copy and not held.grows:

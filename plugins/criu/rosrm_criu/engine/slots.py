@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
-from rosrm.shortage import status
+from rosrm.shortage import exists, status
 
 _REJOIN: Final = "rejoin.json"
 _STARTS: Final = "starts"
@@ -61,13 +61,13 @@ def complete(slot: Path, rejoin: Rejoin) -> None:
 def discard_unfinished(parent: Path) -> None:
     """Remove the images of interrupted dumps."""
     for slot in _slots(parent):
-        if not (slot / _REJOIN).exists():
+        if not exists(slot / _REJOIN):
             shutil.rmtree(slot, ignore_errors=True)
 
 
 def start_without_image(parent: Path) -> None:
     """Make the next start ignore all images, including one that is being made."""
-    if parent.exists():
+    if exists(parent):
         (parent / _IGNORE_IMAGES).touch()
 
 
@@ -78,7 +78,7 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
         CriuError: an image is damaged.
         OSError: no look at an image is possible now.
     """
-    if (parent / _IGNORE_IMAGES).exists():
+    if exists(parent / _IGNORE_IMAGES):
         shutil.rmtree(parent, ignore_errors=True)
         return None
     for slot in _slots(parent):

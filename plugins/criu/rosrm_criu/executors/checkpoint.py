@@ -21,6 +21,7 @@ from typing import Any, Final
 from rosrm import clocks
 from rosrm.errors import CriuError
 from rosrm.runtime import durable
+from rosrm.shortage import exists
 from rosrm_criu.engine import (
     dump,
     external_resources,
@@ -155,8 +156,8 @@ def put_back(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
     """
     asked = StepArguments.of(arguments)
     directory = incoming(asked.state, asked.destination)
-    if not directory.exists():
-        gone = not checkpoint(asked.state, asked.source).exists()
+    if not exists(directory):
+        gone = not exists(checkpoint(asked.state, asked.source))
         return {"active": True} if gone and TAKE in asked.results else {}
     pid = asked.pid(asked.destination)
     try:

@@ -14,6 +14,7 @@ from typing import Any
 
 from rosrm import clocks
 from rosrm.errors import CriuError, PortableError
+from rosrm.shortage import is_directory
 from rosrm_criu.control.client import (
     ask_resume,
     await_joined,
@@ -186,7 +187,7 @@ def introduce(arguments: Answer) -> Answer:
     if refusal := refusal_of_images(arguments["here"]):
         raise CriuError(refusal)
     named = arguments.get("working_directory")
-    if named and not Path(named).expanduser().is_dir():
+    if named and not is_directory(Path(named).expanduser()):
         raise CriuError(f"its working directory {named} does not exist on {asked.host}: make it")
     certificate = artifacts.open_fetcher(asked.destination, float(arguments["keep"]))
     return {"certificate": certificate, "copy": precopy.received_fingerprint(asked)}

@@ -16,6 +16,7 @@ from typing import Any, Final
 
 from rosrm import clocks
 from rosrm.errors import CriuError, PortableError
+from rosrm.shortage import exists
 from rosrm.wording import reason_of
 from rosrm_criu.control.client import await_joined
 from rosrm_criu.engine import dump as dumping
@@ -47,7 +48,7 @@ def dump(arguments: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def why_not_written(parent: Path, error: OSError) -> str:
     """Explain a failed write; the images are missing if the process was restarted since."""
-    if isinstance(error, FileNotFoundError) and not parent.exists():
+    if isinstance(error, FileNotFoundError) and not exists(parent):
         return "the process was restarted during the checkpoint, which removed its images"
     return f"no image can be made in {parent}: {reason_of(error)}"
 
@@ -138,7 +139,7 @@ def call_back_all(state: Path, pids: Mapping[str, int]) -> None:
     for instance, pid in pids.items():
         number = artifacts.number_of(instance)
         away = paths.periodic(state, number) / _AWAY
-        if not away.exists() or attempts.is_busy(number):
+        if not exists(away) or attempts.is_busy(number):
             continue
         try:
             _await_end_of_dump(instance, pid)

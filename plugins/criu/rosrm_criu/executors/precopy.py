@@ -18,6 +18,7 @@ from typing import Final
 
 from rosrm import clocks
 from rosrm.errors import CriuError
+from rosrm.shortage import is_directory, names
 from rosrm_criu.engine import copied_pages, dump, image, memory_copy, page_server, process_tree
 from rosrm_criu.engine.memory_copy import CHANGES, MemoryCopy, file_name
 from rosrm_criu.engine.paths import numbers, received_copy, sent_copy
@@ -313,7 +314,7 @@ def _fetch(asked: StepArguments, fetcher: Fetcher, copied: Answer, directory: Pa
 def received_fingerprint(asked: StepArguments) -> str:
     """Return the fingerprint of the offer of the received copy; "": there is none."""
     with _changing:
-        is_here = received_copy(asked.state, asked.destination).is_dir()
+        is_here = is_directory(received_copy(asked.state, asked.destination))
         return _received.get(asked.destination, "") if is_here else ""
 
 
@@ -363,8 +364,9 @@ def sweep(state: Path) -> None:
         for number in numbers(state, "copy-in"):
             if number not in _received:
                 _renamed(received_copy(state, number))
-    for directory in (state / "images").glob(f"{_UNUSED}*"):
-        artifacts.discard(directory)
+    for name in names(state / "images"):
+        if name.startswith(_UNUSED):
+            artifacts.discard(state / "images" / name)
 
 
 def _renamed(directory: Path) -> Path:

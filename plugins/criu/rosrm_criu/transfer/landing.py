@@ -17,6 +17,7 @@ from typing import Final
 
 from rosrm.errors import TransferError
 from rosrm.runtime.disk_space import room_for
+from rosrm.shortage import names, status
 from rosrm.wording import reason_of
 
 _PREFIX: Final = ".rosrm-fetch-"
@@ -39,7 +40,7 @@ class StagingDirectory:
         self._target = target
         self._lock = -1
         parent = target.parent
-        if os.path.lexists(target):
+        if status(target, follow_symlinks=False):
             raise TransferError(f"{target} exists already: nothing is fetched over it")
         try:
             parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -88,7 +89,7 @@ def _locked(directory: Path) -> Iterator[None]:
 
 
 def _remove_stale(parent: Path) -> None:
-    for path in parent.glob(f"{_PREFIX}*"):
+    for path in (parent / name for name in names(parent) if name.startswith(_PREFIX)):
         try:
             descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
         except OSError:
