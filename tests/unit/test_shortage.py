@@ -37,9 +37,6 @@ ALIKE = {
     "rosrm_criu/engine/shim.py: _restore_as_child": "the guard has ended",
     "rosrm_criu/executors/precopy.py: put_in_place": "the check of the image names the file",
     "rosrm_criu/transfer/landing.py: _remove_stale": "it stays until the next fetch",
-    "rosrm_resources/disk.py: tree_bytes": "a reading lacks a part until the next one",
-    "rosrm_resources/disk.py: writes_to": "the next reading looks again",
-    "rosrm_resources/disk.py: written_bytes": "a reading lacks a part until the next one",
 }
 #: Files of the plugins with errors of connections alone, each of which ends the connection.
 OF_CONNECTIONS = ("receiving.py", "sending.py", "starting.py")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rosrm import ConfigError
-from rosrm.shortage import is_directory, raise_shortage
+from rosrm.shortage import is_directory, raise_unless_absent
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,13 @@ def read_number(path: Path) -> float | None:
     """Return the number in a control file; None: no file, or no limit ("max" or -1).
 
     Raises:
-        OSError: the system has no room for a look.
+        OSError: no look is possible now.
     """
     try:
         word = path.read_text().split()[0]
     except (OSError, IndexError) as error:
         if isinstance(error, OSError):
-            raise_shortage(error)
+            raise_unless_gone(error)
         return None
     if word in ("max", "-1"):
         return None
@@ -136,13 +136,19 @@ def lines_of(file: Path) -> list[str]:
     """Return the lines of a file of /proc, whose paths may have any bytes; []: it is not there.
 
     Raises:
-        OSError: the system has no room for a look.
+        OSError: no look is possible now.
     """
     try:
         return os.fsdecode(file.read_bytes()).split("\n")[:-1]
     except OSError as error:
-        raise_shortage(error)
+        raise_unless_gone(error)
         return []
+
+
+def raise_unless_gone(error: OSError) -> None:
+    """Raise an error unless a process or file is gone, or belongs to another user."""
+    if not isinstance(error, PermissionError):
+        raise_unless_absent(error)
 
 
 def _unescaped(path: str) -> str:

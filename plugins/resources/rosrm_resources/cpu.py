@@ -10,8 +10,14 @@ from pathlib import Path
 from typing import Final
 
 from rosrm import PositiveSeconds, ProbeContext, Sessions
-from rosrm.shortage import exists, is_directory, raise_shortage
-from rosrm_resources.cgroups import Group, count_cpus, find_group, read_number
+from rosrm.shortage import exists, is_directory
+from rosrm_resources.cgroups import (
+    Group,
+    count_cpus,
+    find_group,
+    raise_unless_gone,
+    read_number,
+)
 from rosrm_resources.files import OpenFile, ProcessFiles
 from rosrm_resources.gauge import Gauge, GaugeProbe, Scope, budget, check_group
 from rosrm_resources.paced import Paced
@@ -251,7 +257,7 @@ def _cpu_set(group: Group, root: Path) -> tuple[Path, float] | None:
         try:
             size = count_cpus((directory / name).read_text())
         except OSError as error:  # the controller is not enabled here, so the group above counts
-            raise_shortage(error)
+            raise_unless_gone(error)
             continue
         if own and size != own:  # the set above contains this one, so another size is another set
             break

@@ -11,7 +11,7 @@ from typing import Final
 
 from rosrm import PositiveSeconds, ProbeContext, Sessions
 from rosrm.shortage import exists
-from rosrm_resources.cgroups import lines_of
+from rosrm_resources.cgroups import lines_of, raise_unless_gone
 from rosrm_resources.gauge import GaugeProbe, Scope, budget
 
 #: Largest fraction of the time that walks through the directory may take.
@@ -149,25 +149,34 @@ def device_of(path: Path) -> str:
 
 
 def written_bytes(pid: int) -> float:
-    """Return the bytes that a process has written to disks; 0 if that is not known."""
+    """Return the bytes that a process has written to disks; 0: it has ended, or is not ours.
+
+    Raises:
+        OSError: no look is possible now.
+    """
     try:
         fields = _fields(f"/proc/{pid}/io")
-        return max(0.0, float(fields["write_bytes"]) - float(fields["cancelled_write_bytes"]))
-    except (OSError, KeyError):  # it has ended, or is of another user
+    except OSError as error:
+        raise_unless_gone(error)
         return 0.0
+    return max(0.0, float(fields["write_bytes"]) - float(fields["cancelled_write_bytes"]))
 
 
 def writes_to(pid: int, device: str) -> bool:
-    """Return True if a process has a file on a device open for writing."""
+    """Return True if a process has a file on a device open for writing.
+
+    Raises:
+        OSError: no look is possible now.
+    """
     try:
         devices = _devices(pid)
         for descriptor in os.listdir(f"/proc/{pid}/fdinfo"):  # noqa: PTH208 - no Path for each
             fields = _fields(f"/proc/{pid}/fdinfo/{descriptor}")
             writes = int(fields["flags"], 8) & os.O_ACCMODE != os.O_RDONLY
-            if writes and devices.get(fields["mnt_id"]) == device:
+            if writes and devices.get(fields.get("mnt_id", "")) == device:
                 return True
-    except (OSError, KeyError):  # it, or its file, is gone since
-        return False
+    except OSError as error:  # it, or its file, is gone since
+        raise_unless_gone(error)
     return False
 
 
@@ -211,14 +220,25 @@ class DirectoryTree:
         self._clock = clock
         self._due = clock()
         self._usage = 0.0
+        self._fault: OSError | None = None  # of the last walk
 
     def usage(self) -> float:
-        """Return the fraction of the budget in use at the last walk."""
+        """Return the fraction of the budget in use at the last walk.
+
+        Raises:
+            OSError: the last walk has failed.
+        """
         started = self._clock()
         if started >= self._due:
-            self._usage = tree_bytes(self._path) / self.capacity
+            self._fault = None
+            try:
+                self._usage = tree_bytes(self._path) / self.capacity
+            except OSError as error:
+                self._fault = error
             took = self._clock() - started
             self._due = started + max(self._period, took / _WALK_SHARE)
+        if self._fault is not None:
+            raise self._fault.with_traceback(None)
         return self._usage
 
     def close(self) -> None:
@@ -226,13 +246,20 @@ class DirectoryTree:
 
 
 def tree_bytes(path: str) -> int:
-    """Return the bytes on disk of all files below a directory, without following links."""
+    """Return the bytes on disk of all files below a directory, without following links.
+
+    Directories that are deleted since, or not readable for this user, do not count.
+
+    Raises:
+        OSError: no look is possible now, so the bytes are not known.
+    """
     total = 0
     waiting = [path]
     while waiting:
         try:
             entries = os.scandir(waiting.pop())
-        except OSError:  # deleted since, or not readable for this user
+        except OSError as error:
+            raise_unless_gone(error)
             continue
         with entries:
             for entry in entries:
@@ -240,6 +267,6 @@ def tree_bytes(path: str) -> int:
                     total += entry.stat(follow_symlinks=False).st_blocks * _BLOCK
                     if entry.is_dir(follow_symlinks=False):
                         waiting.append(entry.path)
-                except FileNotFoundError:  # deleted since, e.g. a rotated log
-                    continue
+                except OSError as error:  # deleted since, e.g. a rotated log
+                    raise_unless_gone(error)
     return total

@@ -1,5 +1,6 @@
 """CPU, memory and disk of a slice: the slave's own process tree against a budget."""
 
+import errno
 import os
 import shutil
 from pathlib import Path
@@ -10,9 +11,10 @@ from rosrm.errors import ConfigError
 from rosrm.testing import FakeClock, FakeSessions, probe_context
 from rosrm_resources import cpu, disk, memory
 from rosrm_resources.cpu import SliceCpu
-from rosrm_resources.disk import DirectoryTree, tree_bytes
+from rosrm_resources.disk import DirectoryTree, tree_bytes, writes_to
 from rosrm_resources.files import ProcessFiles
 from rosrm_resources.memory import SliceMemory
+from tests.failing_calls import nth_call_fails
 
 TICKS = os.sysconf("SC_CLK_TCK")
 PAGE = os.sysconf("SC_PAGE_SIZE")
@@ -249,6 +251,47 @@ def test_long_walk_makes_the_next_wait(tmp_path, monkeypatch):
     clock.advance(10.0)
     gauge.usage()
     assert len(walks) == 2
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.ESTALE])
+def test_disk_of_a_slice_is_unknown_after_any_call_that_fails(tmp_path, number):
+    """A part that cannot be looked at is not empty; the next walk looks again."""
+    (tmp_path / "a/b").mkdir(parents=True)
+    (tmp_path / "a/b/file").write_bytes(b"x" * 10_000)
+    size, now = float(tree_bytes(str(tmp_path))), [0.0]
+    for n in range(20):
+        tree = DirectoryTree(tmp_path, size, clock=lambda: now[0])
+        with nth_call_fails(n, number) as count:
+            seen = usage_of(tree)
+        if not count.failed:
+            break
+        assert seen is None
+        assert usage_of(tree) is None  # there was no other walk
+        now[0] += 5.0
+        assert usage_of(tree) == 1.0
+    assert 5 <= n < 20
+
+
+def usage_of(tree: DirectoryTree) -> float | None:
+    try:
+        return tree.usage()
+    except OSError:
+        return None
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO, errno.ESTALE])
+def test_a_writer_is_not_left_out_by_a_call_that_fails(tmp_path, number):
+    device, before = disk.device_of(tmp_path), disk.written_bytes(os.getpid())
+    with (tmp_path / "open").open("w"):
+        for n in range(1000):
+            try:
+                with nth_call_fails(n, number) as count:
+                    amount, writes = disk.written_bytes(os.getpid()), writes_to(os.getpid(), device)
+            except OSError:
+                continue
+            assert (amount >= before, writes) == (True, True)
+            break
+    assert not count.failed
 
 
 def test_disk_without_a_budget_is_the_file_system(tmp_path):
