@@ -19,6 +19,7 @@ log_tail.py        last lines of a log, for error texts
 memory_file.py     files without a place on a disk
 crash_notes.py     notes of the running calls of plugins, for the next start
 path_calls.py      threads for calls on paths that users name
+file_thread.py     a thread for calls on a directory that may not answer
 worker.py          a thread for blocking work of a loop
 ros_wheels.py      the environment of ROS 2 from wheels
 """

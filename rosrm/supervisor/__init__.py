@@ -6,7 +6,6 @@
     boot_timer.py         timer of the boot clock, for the waits of the event loop
     endpoint.py           both ends of the socket, and one supervisor for one host
     connection.py         the supervisor's side of a connection, with send_buffer.py
-    file_thread.py        file calls in a thread, because a directory may not answer
     spawn.py              start of one process: fork, and what its child does until the exec
     spawn_error.py        failures of a spawn
     spawn_into.py         the fork into a control group of version 2

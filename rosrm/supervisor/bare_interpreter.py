@@ -18,8 +18,8 @@ def main() -> None:
     sys.path.append(os.path.dirname(package))  # last: the standard library takes precedence
 
     # ruff: noqa: PLC0415 - these can be imported only now
-    from rosrm.runtime import oom_score, timer_slack
-    from rosrm.supervisor import descriptors, endpoint, file_thread, own_log
+    from rosrm.runtime import file_thread, oom_score, timer_slack
+    from rosrm.supervisor import descriptors, endpoint, own_log
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 

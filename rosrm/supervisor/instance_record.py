@@ -41,9 +41,9 @@ from rosrm.core.supervisor.instance import (
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import Key
 from rosrm.runtime import durable
+from rosrm.runtime.file_thread import Call, FileThread
 from rosrm.runtime.private_files import open_private
 from rosrm.supervisor import json_lines, messages, paths, procfs
-from rosrm.supervisor.file_thread import Call, FileThread
 from rosrm.supervisor.messages import Launch
 from rosrm.wording import reason_of
 

@@ -12,10 +12,10 @@ from math import inf
 from typing import Final
 
 from rosrm.core.supervisor.events import ContactReported
+from rosrm.runtime.file_thread import FileThread
 from rosrm.runtime.private_files import open_private
 from rosrm.shortage import raise_shortage
 from rosrm.supervisor import own_log, paths, procfs
-from rosrm.supervisor.file_thread import FileThread
 from rosrm.wording import reason_of
 
 _NONE: Final = ContactReported(-inf, -inf)

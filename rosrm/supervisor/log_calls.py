@@ -11,8 +11,8 @@ from functools import partial
 
 from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.rules import Key
-from rosrm.supervisor import paths
-from rosrm.supervisor.file_thread import Call, FileThread
+from rosrm.runtime.file_thread import Call, FileThread
+from rosrm.supervisor import own_log, paths
 from rosrm.supervisor.logs import BUSY, QUIET, LogKeeper, LogLimits, note_trace
 
 
@@ -26,7 +26,7 @@ class LogCalls:
     """
 
     def __init__(self, state: str, limits: LogLimits, known: Mapping[Key, Instance]) -> None:
-        self.disk = FileThread(paths.log_folder(state))
+        self.disk = FileThread(paths.log_folder(state), report=own_log.write_fault)
         self._keeper = LogKeeper(state, limits, known)
         self._opened: dict[Key, int] = {}  # descriptors for the loop
         self._known: set[Key] = set()  # instances with something to release

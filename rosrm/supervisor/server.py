@@ -27,6 +27,7 @@ from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import AdoptionRule, Key
 from rosrm.model import start_trace
 from rosrm.runtime import durable
+from rosrm.runtime.file_thread import LATE, FileThread, NoAnswer
 from rosrm.runtime.oom_score import score_of_children
 from rosrm.runtime.signalling import send
 from rosrm.supervisor import (
@@ -43,7 +44,6 @@ from rosrm.supervisor import (
 from rosrm.supervisor.boot_timer import BootTimer
 from rosrm.supervisor.confinement import Confined, Confinement, Steps
 from rosrm.supervisor.connection import Connection
-from rosrm.supervisor.file_thread import LATE, FileThread, NoAnswer
 from rosrm.supervisor.instance_groups import LimitRefused
 from rosrm.supervisor.instance_record import InstanceRecord
 from rosrm.supervisor.json_lines import ProtocolError
@@ -120,7 +120,7 @@ class Server:
             state, self._selector, self._happened, self._groups, self._reaped,
             lambda: {pid: start.key for pid, start in self._starts.items()},
         )  # fmt: skip
-        self.disk = FileThread(state)
+        self.disk = FileThread(state, report=own_log.write_fault)
         self._record = InstanceRecord(state, self.disk)
         self._last_contact = lease_file.LastContact(state, self.disk)
         self._logs = LogCalls(state, limits, self._core.instances)

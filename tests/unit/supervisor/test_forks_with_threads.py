@@ -14,7 +14,8 @@ from tests.waiting import PATIENCE
 #: interpreter. Prints each child that does not end well.
 SCRIPT = """
 import _thread, os, signal
-from rosrm.supervisor import file_thread, spawn_into
+from rosrm.runtime import file_thread
+from rosrm.supervisor import spawn_into
 
 file_thread.let_threads_wait()
 spawn_into._CLONE_INTO_CGROUP = 0

@@ -19,8 +19,8 @@ from rosrm.core.supervisor.instance import Instance
 from rosrm.core.supervisor.reducer import SupervisorState
 from rosrm.core.supervisor.rules import FenceRule, RestartRule, StopRule
 from rosrm.model.durations import LONGEST_STOP
+from rosrm.runtime.file_thread import FileThread
 from rosrm.supervisor import endpoint, instance_record, messages, procfs, spawn, takeover
-from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.json_lines import ProtocolError, line
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.server import LONGEST_WAIT, Server

@@ -7,8 +7,8 @@ from math import inf
 import pytest
 
 from rosrm.core.supervisor.events import ContactReported
+from rosrm.runtime.file_thread import FileThread
 from rosrm.supervisor import lease_file
-from rosrm.supervisor.file_thread import FileThread
 from tests.limits import no_more_files
 from tests.waiting import PATIENCE
 

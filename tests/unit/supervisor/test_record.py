@@ -15,9 +15,9 @@ from rosrm.core.supervisor import events
 from rosrm.core.supervisor.instance import EXITED, Instance
 from rosrm.core.supervisor.reducer import MOST_TOMBSTONES, SupervisorState
 from rosrm.core.supervisor.rules import LimitRule, RestartRule, RunLimits, StopRule
+from rosrm.runtime.file_thread import FileThread
 from rosrm.supervisor import instance_record as rc
 from rosrm.supervisor import takeover
-from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.messages import Amend, Launch
 from tests.limits import no_more_files
 from tests.waiting import PATIENCE, wait_until

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from rosrm.supervisor import file_thread
-from rosrm.supervisor.file_thread import FileThread, NoAnswer
+from rosrm.runtime import file_thread
+from rosrm.runtime.file_thread import FileThread, NoAnswer
 from tests.waiting import wait_until
 
 

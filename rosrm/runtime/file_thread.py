@@ -1,4 +1,4 @@
-"""File calls of the supervisor in a thread: a directory that does not answer blocks no loop.
+"""File calls of a loop in a thread: a directory that does not answer blocks no loop.
 
 On a file system that does not answer (a dead NFS server, a failing disk), each call waits without
 a limit. So the loop hands its calls on one directory to a thread, which executes them in order. The
@@ -22,7 +22,6 @@ from collections.abc import Callable
 from typing import Any, Final, Generic, TypeVar
 
 from rosrm import clocks
-from rosrm.supervisor import own_log
 
 #: Maximum time, in seconds, that the loop waits for a call.
 LATE: Final = 1.0
@@ -89,11 +88,15 @@ class FileThread:
     Args:
         directory: named in the texts of exceptions.
         patience: most seconds that the loop waits for a call.
+        report: takes the text of a failure of `tell`, while its exception is handled.
     """
 
-    def __init__(self, directory: str, patience: float = LATE) -> None:
+    def __init__(
+        self, directory: str, patience: float = LATE, report: Callable[[str], object] = print
+    ) -> None:
         self.directory = directory
         self._patience = patience
+        self._report = report
         self._queue: SimpleQueue[Call[Any]] = SimpleQueue()
         self._unfinished: deque[Call[Any]] = deque()
         self._told: list[Call[None]] = []
@@ -128,7 +131,7 @@ class FileThread:
         return True
 
     def tell(self, work: Callable[[], object]) -> None:
-        """Queue a call by the next `begin` or `pass_on`; only the log has its failure.
+        """Queue a call by the next `begin` or `pass_on`; only `report` has its failure.
 
         Until then the thread does not compete with the loop for the interpreter.
         """
@@ -137,7 +140,7 @@ class FileThread:
             try:
                 work()
             except Exception as fault:  # noqa: BLE001 - as in `Call.execute`
-                own_log.write_fault(f"a call on {self.directory} failed: {fault}")
+                self._report(f"a call on {self.directory} failed: {fault}")
 
         self._told.append(Call(guarded))
 
