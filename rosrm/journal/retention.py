@@ -62,12 +62,17 @@ class Retention:
         database: with the table `record`.
         keep_events: newest events kept.
         keep_bytes: most bytes of their texts.
+
+    Attributes:
+        is_exceeded: `delete` has something to do.
     """
 
     def __init__(self, database: sqlite3.Connection, keep_events: int, keep_bytes: int) -> None:
         self._database = database
         self._all = _Bound("1", keep_events, keep_bytes)
         self._refusals = _Bound(_IS_REFUSAL, keep_events // _SHARE, keep_bytes // _SHARE)
+        self.is_exceeded = False
+        self._bounds = (self._refusals, self._all)
         self._pause = 0
         self._is_first = True  # short runs would add up to any excess
         held = database.execute(
@@ -77,22 +82,31 @@ class Retention:
             self._count(bool(is_refusal), int(count), int(size))
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Count new events; delete old ones beyond the bounds.
-
-        A deletion that fails is tried again later, because the new events are durable already.
-        """
+        """Count new events."""
         for row in rows:
             self._count(row[3] in _REFUSALS, 1, _EACH + sum(map(len, row[4:])))
             self._pause -= 1
-        if self._pause > 0:
+        self.is_exceeded = self._pause <= 0 and any(map(self._exceeds, self._bounds))
+        self._is_first = self._is_first and (self.is_exceeded or self._pause > 0)
+
+    def delete(self) -> None:
+        """Delete old events beyond the bounds.
+
+        A deletion that fails is tried again later, because the new events are durable already.
+        """
+        if not self.is_exceeded:
             return
+        self.is_exceeded = False
         try:
-            for bound in (self._refusals, self._all):
-                if bound.is_exceeded or (self._is_first and not bound.is_kept):
+            for bound in self._bounds:
+                if self._exceeds(bound):
                     self._delete(bound)
             self._is_first = False
         except sqlite3.Error:
             self._pause = _TRY_AGAIN
+
+    def _exceeds(self, bound: _Bound) -> bool:
+        return bound.is_exceeded or (self._is_first and not bound.is_kept)
 
     def _count(self, is_refusal: bool, count: int, size: int) -> None:
         self._all.add(count, size)

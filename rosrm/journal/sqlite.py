@@ -3,12 +3,17 @@
 One group of records and intents is one transaction. In WAL mode with `synchronous=NORMAL` a
 committed group survives a kill of the process at any instant. With `FULL`, each commit flushes the
 disk, so the group also survives a power failure.
+
+A checkpoint of the write-ahead log waits for the disk, too. So it is no part of a write but of
+`tidy`, which follows the answer to the write. Readers have a connection of their own, and wait for
+no write.
 """
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -39,8 +44,9 @@ CREATE TABLE intent (
 
 #: Milliseconds for which a write waits while another program has locked the file.
 _PATIENCE_MS: Final = 200
-#: Bytes to which the write-ahead log is cut after a checkpoint.
-_LONGEST_LOG: Final = 16 << 20
+#: Bytes of the write-ahead log beyond which a checkpoint begins it again. The first write after a
+#: checkpoint cuts the file to this size, so a longer file has new content.
+_LONGEST_LOG: Final = 4 << 20
 
 
 class SqliteJournal:
@@ -68,6 +74,7 @@ class SqliteJournal:
         wall: Callable[[], float] = clocks.wall_time,
     ) -> None:
         self._path = path
+        self._log = f"{path}-wal"
         self._wall = wall
         try:
             make_private_directory(path.parent)
@@ -75,20 +82,22 @@ class SqliteJournal:
         except OSError as error:
             raise fault_of(path, error) from error
         self._database = self._guarded(lambda: self._open(sync))
+        self._reader: sqlite3.Connection = self._guarded(lambda: self._connect(_PATIENCE_MS))
         newest = self._guarded(
-            lambda: self._database.execute("SELECT max(sequence) FROM record").fetchone()
+            lambda: self._reader.execute("SELECT max(sequence) FROM record").fetchone()
         )
         self._sequence = int(newest[0] or 0)
         self._retention: Retention = self._guarded(
             lambda: Retention(self._database, keep_events, keep_bytes)
         )
+        self._is_long = False
 
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:
             raise sqlite3.DatabaseError("it is empty: not even tables are in it")
         if not self._path.exists():
             self._create()
-        database = sqlite3.connect(self._path, isolation_level=None, timeout=2.0)
+        database = self._connect(2000)
         try:
             self._prepare(database, sync)
         except BaseException:  # also an interrupt must leave no open file
@@ -96,10 +105,17 @@ class SqliteJournal:
             raise
         return database
 
+    def _connect(self, patience_ms: int) -> sqlite3.Connection:
+        """Return a connection, which one thread at a time uses."""
+        return sqlite3.connect(
+            self._path, isolation_level=None, timeout=patience_ms / 1000.0, check_same_thread=False
+        )
+
     def _prepare(self, database: sqlite3.Connection, sync: str) -> None:
         database.execute("PRAGMA journal_mode=WAL")
         self._make_private()  # SQLite creates its files by the umask
         database.execute(f"PRAGMA journal_size_limit={_LONGEST_LOG}")
+        database.execute("PRAGMA wal_autocheckpoint=0")
         database.execute(f"PRAGMA synchronous={'FULL' if sync == 'full' else 'NORMAL'}")
         (version,) = database.execute("PRAGMA user_version").fetchone()
         if version not in (0, SCHEMA):
@@ -142,12 +158,25 @@ class SqliteJournal:
     def write(
         self, records: Sequence[Record], intents: Sequence[Intent], now: float
     ) -> Sequence[StoredRecord]:
-        """Append records and replace intents in one atomic group.
+        """Append records and replace intents in one atomic group, and tidy.
 
         Raises:
             JournalBlocked: a temporary failure; nothing was changed, and a retry is safe.
             JournalError: the file is damaged.
         """
+        stored = self.commit(records, intents, now)
+        if self.is_untidy:
+            self.tidy()
+        return stored
+
+    def commit(
+        self, records: Sequence[Record], intents: Sequence[Intent], now: float
+    ) -> Sequence[StoredRecord]:
+        """Write a group; raises as `write`. As long as the journal `is_untidy`, call `tidy` next.
+
+        So no group waits for the disk longer than its own promise needs.
+        """
+        durable.check_thread()
         wall = self._wall()
         first = self._sequence + 1
         stored = [StoredRecord(first + i, wall, now, record) for i, record in enumerate(records)]
@@ -156,7 +185,30 @@ class SqliteJournal:
         self._guarded(lambda: self._write(rows, newest))
         self._sequence += len(stored)
         self._retention.add(rows)
+        self._is_long = self._log_size() > _LONGEST_LOG
         return stored
+
+    def _log_size(self) -> int:
+        try:
+            return os.stat(self._log).st_size  # noqa: PTH116 - for each group
+        except OSError:  # somebody has removed it; the next write fails
+            return 0
+
+    @property
+    def is_untidy(self) -> bool:
+        """Return True if old events or the write-ahead log exceed their bounds."""
+        return self._is_long or self._retention.is_exceeded
+
+    def tidy(self) -> None:
+        """Delete old events, and begin the write-ahead log again; this may wait for the disk.
+
+        A failure, such as a full disk, changes nothing: `tidy` is called again after later groups.
+        """
+        durable.check_thread()
+        self._retention.delete()
+        if self._is_long:
+            with contextlib.suppress(sqlite3.Error):
+                self._database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
 
     def _write(
         self,
@@ -196,7 +248,7 @@ class SqliteJournal:
         """
 
         def force() -> None:
-            durable.sync(f"{self._path}-wal")
+            durable.sync(self._log)
             durable.sync_directory(str(self._path.parent))
 
         self._guarded(force)
@@ -204,16 +256,14 @@ class SqliteJournal:
     def tables(self) -> list[str]:
         """Return the tables that have intents; raises `JournalError`."""
         rows = self._guarded(
-            lambda: self._database.execute(
-                "SELECT DISTINCT tbl FROM intent ORDER BY tbl"
-            ).fetchall()
+            lambda: self._reader.execute("SELECT DISTINCT tbl FROM intent ORDER BY tbl").fetchall()
         )
         return [table for (table,) in rows]
 
     def intents(self, table: str) -> Mapping[str, Mapping[str, Any]]:
         """Return all intents of a table by key."""
         rows = self._guarded(
-            lambda: self._database.execute(
+            lambda: self._reader.execute(
                 "SELECT key, value FROM intent WHERE tbl = ?", (table,)
             ).fetchall()
         )
@@ -232,7 +282,7 @@ class SqliteJournal:
             where.append("(host = ? OR instr(facts, ?))")
             matched += [host, f'"from": {json.dumps(host)}']
         rows = self._guarded(
-            lambda: self._database.execute(
+            lambda: self._reader.execute(
                 f"SELECT * FROM record WHERE {' AND '.join(where)} "  # noqa: S608 - fixed words
                 "ORDER BY sequence DESC LIMIT ?",
                 (*matched, newest),
@@ -251,6 +301,8 @@ class SqliteJournal:
 
     def close(self) -> None:
         """Flush and close the files."""
+        # Only the last connection moves the log into the file as it closes.
+        self._guarded(self._reader.close)
         self._guarded(self._database.close)
 
 

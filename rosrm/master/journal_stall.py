@@ -1,24 +1,35 @@
-"""Journal stall: the state of a master that cannot write its journal.
+"""Journal stall: the state of a master whose journal is not written yet, or cannot be written.
 
-The decisions of the last turn are neither executed nor lost. The master retries to write them, and
-executes them and decides again only after that succeeds. During the stall the master sends beats,
-receives readings and answers queries; it refuses other requests. The core's clock is stopped, so
-that no deadline passes and no host counts as silent.
+The decisions of the last turn are neither executed nor lost. The master waits for a slow write, and
+retries a failed one; it executes them and decides again only after that succeeds. During the stall
+the master sends beats, receives readings and answers queries. It refuses other requests, but while
+a write is merely slow it first holds them for some seconds. The core's clock is stopped, so that no
+deadline passes and no host counts as silent.
 """
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, get_args
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Command, Reply
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.recovery.journal_stall import note_readings
+from rosrm.errors import JournalBlocked
+from rosrm.master.journal_writer import JournalLate
 
+_log = logging.getLogger("rosrm.master")
+
+#: Seconds for which requests are held while a write is slow. A client waits 10 s for an answer, so
+#: that it receives the reason of a refusal.
+_HOLD: Final = 5.0
 #: Most queued status batches; the master requests the rest again from the slaves.
 _MOST_STATUSES: Final = 10_000
+#: Events with an answer that somebody waits for.
+_REQUESTS: Final = (happened.HostRegistered, *get_args(happened.ClientRequest))
 #: Events that are dropped, because they recur.
 _DROPPED: Final = (
     happened.TimePassed, happened.UsagesReceived, happened.PeerRefused, happened.SourceStranded,
@@ -29,33 +40,55 @@ _NEWEST: Final = (happened.ProcessRequested, happened.SnapshotsReported, happene
 
 @dataclass(slots=True)
 class JournalStall:
-    """Journal stall, from the first failed write of a group until the write succeeds.
+    """Journal stall, from the first late or failed write of a group until the write succeeds.
 
     Attributes:
         commands: the commands that are not durable yet, in order.
-        reason: text of the failure, for clients.
+        fault: the last failure, or a `JournalLate`: the write continues.
         since: monotonic time of the first failure, seconds.
         core_now: time of the core's stopped clock.
         tried: monotonic time of the last attempt to write, seconds.
+        refuses: True: requests are refused; False: they are held.
     """
 
     commands: Sequence[Command]
-    reason: str
+    fault: JournalBlocked
     since: float
     core_now: float
     tried: float
+    refuses: bool = False
     _waiting: list[happened.Event] = field(default_factory=list)
     _newest: dict[tuple[type, int], happened.Event] = field(default_factory=dict)
     _statuses: int = 0
 
+    @property
+    def is_late(self) -> bool:
+        """Return True while a write continues, which must not be repeated."""
+        return isinstance(self.fault, JournalLate)
+
     def take(
-        self, state: MasterState, events: Iterable[happened.Event], reply: Callable[[Reply], None]
-    ) -> None:
-        """Apply readings, refuse requests, and queue other events."""
+        self, state: MasterState, events: Iterable[happened.Event],
+        reply: Callable[[Reply], None], now: float,
+    ) -> None:  # fmt: skip
+        """Apply readings, hold or refuse requests, and queue other events.
+
+        Args:
+            state: of the core.
+            events: in order.
+            reply: sends a refusal.
+            now: monotonic time, seconds.
+        """
+        if not self.refuses and (not self.is_late or now - self.since >= _HOLD):
+            self.refuses = True
+            _log.error(
+                "%s. Running processes continue; the master accepts no new work until then",
+                self.fault,
+            )
+            events, self._waiting, self._statuses = [*self._waiting, *events], [], 0
         for event in events:
             if isinstance(event, happened.ReadingsReceived):
                 note_readings(state, event, self.core_now)
-            elif isinstance(event, happened.HostRegistered | happened.ClientRequest):
+            elif self.refuses and isinstance(event, _REQUESTS):
                 reply(Reply(event.request, False, "journal", self.refusal))
             elif isinstance(event, _NEWEST):
                 self._newest[type(event), event.host_id] = event  # replaces older ones
@@ -77,6 +110,6 @@ class JournalStall:
     def refusal(self) -> str:
         """Return the reason with which requests are refused."""
         return (
-            f"the master accepts no new work: {self.reason}. Running processes continue, and the "
-            f"master accepts work again as soon as it can write"
+            f"the master accepts no new work: {self.fault.public}. Running processes continue, and "
+            f"the master accepts work again as soon as it can write"
         )

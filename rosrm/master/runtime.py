@@ -45,6 +45,7 @@ from rosrm.keys.finding import master_security
 from rosrm.master.diagnostics import DiagnosticsFeed
 from rosrm.master.grants_watch import GrantsWatch
 from rosrm.master.journal_stall import JournalStall
+from rosrm.master.journal_writer import JournalLate, JournalWriter
 from rosrm.master.queries import MasterQueries
 from rosrm.master.recorder import Recorder
 from rosrm.master.settings_reload import SettingsReload
@@ -150,15 +151,16 @@ class MasterRuntime:
         self._behind = 0.0  # seconds that the core's clock is behind: its start and blocked time
         self._closing = contextlib.ExitStack()
         with contextlib.ExitStack() as opened:
-            opened.enter_context(
+            lock = opened.enter_context(
                 only_one(config.state, "master", code="second_master", remedy="another `state:`")
             )
+            path = config.state / "journal.sqlite"
             self._journal = SqliteJournal(
-                config.state / "journal.sqlite",
-                sync=config.journal.sync, keep_events=config.journal.keep_events,
+                path, sync=config.journal.sync, keep_events=config.journal.keep_events,
                 keep_bytes=config.journal.keep_bytes,
             )  # fmt: skip
-            opened.callback(self._journal.close)
+            self._writer = JournalWriter(self._journal, path)
+            opened.callback(self._close_journal, lock)
             # From here on Ctrl-C causes an orderly shutdown; before, it ends the process at once.
             handle_signals(self._stop, self._reload.hang_up)
             opened.callback(self._reload.close)
@@ -173,9 +175,9 @@ class MasterRuntime:
             # During the restore, the first answers arrive.
             self._restore(begun)
             self._refuse_second(search)
-            self._behind = self._now() - begun  # nothing was decided in that time
             opened.callback(self._end_record)
             self._begin_run(last, begun)
+            self._behind = self._now() - begun  # nothing was decided in that time
             search.end()
             opened.enter_context(RequestSocket(self._endpoints))
             self._diagnostics = self._new_diagnostics()
@@ -207,6 +209,12 @@ class MasterRuntime:
             search.refuse_registrations(reason)
             raise Refused(reason, "second_master")
 
+    def _close_journal(self, lock: int) -> None:
+        if not self._writer.close():
+            # Its last write may still succeed. The next master must not begin before the end of
+            # this process, which releases the lock.
+            os.dup(lock)
+
     def _new_state(
         self, placement: PlacementPlugins, strategies: dict[str, MigrationStrategy], epoch: int
     ) -> MasterState:
@@ -234,7 +242,8 @@ class MasterRuntime:
         state = self._state
         journal_gap.begin(state, last.newest, now, machine_rebooted=last.machine_rebooted)
         started = f"master {self._config.name} started, epoch {state.epoch}"
-        self._journal.write(
+        # Durable: otherwise the next master would not notice that it lost this run.
+        self._writer.write_durably(
             [Record(EventKind.MASTER_STARTED, message=started)],
             # Both in one group, because from the boot id alone the next master cannot tell which
             # hosts this one waited for.
@@ -242,11 +251,14 @@ class MasterRuntime:
                 Intent("cluster", "epoch", {"epoch": state.epoch, "boot": _boot()}),
                 journal_gap.intent(state),
             ],
-            0.0,
+            meanwhile=self._stay_in_contact,
         )
-        # Otherwise the next master would not notice that it lost this run.
-        self._journal.make_durable()
         self._record_from(state, now)
+
+    def _stay_in_contact(self) -> None:
+        """Send a beat and take what has arrived, before the loop runs."""
+        self._beat(self._now())
+        self._participant.spin(0.0)
 
     def _last_run(self) -> _LastRun:
         known = self._journal.intents("cluster").get("epoch", {"epoch": 0})
@@ -299,7 +311,7 @@ class MasterRuntime:
 
     def _trouble(self) -> str:
         """Return why the master accepts no new work; "" if it does."""
-        return self._held.refusal if self._held is not None else ""
+        return self._held.refusal if self._held is not None and self._held.refuses else ""
 
     def _now(self) -> float:
         return clocks.boot_time()
@@ -372,7 +384,10 @@ class MasterRuntime:
     def _say_stopped(self) -> None:
         try:
             message = f"master stopped: {self._stopping}"
-            self._write([Record(EventKind.MASTER_STOPPED, message=message)])
+            record = Record(EventKind.MASTER_STOPPED, message=message)
+            self._writer.write_last(record, self._now() - self._started)
+        except JournalLate as fault:
+            _log.warning("%s; the last decisions were not executed", fault)
         except JournalBlocked as fault:
             _log.warning("%s; the last decisions were neither written nor executed", fault)
         _log.info(
@@ -413,9 +428,9 @@ class MasterRuntime:
 
     def _take_in(self, now: float) -> None:
         """Pass all received events to the core in order, and execute its commands as a group."""
-        if self._held is not None and not self._write_held(self._held, now):
+        if self._held is not None and not self._end_stall(self._held, now):
             self._held.take(
-                self._state, self._endpoint.take_events(), self._endpoint.services.reply
+                self._state, self._endpoint.take_events(), self._endpoint.services.reply, now
             )
             return
         self._state.wall = clocks.wall_time()
@@ -466,32 +481,35 @@ class MasterRuntime:
         try:
             stored = self._write(commands)
         except JournalBlocked as fault:
-            self._held = JournalStall(commands, fault.public, now, self._core_now(now), now)
-            _log.error(
-                "%s. Running processes continue; the master accepts no new work until then", fault
-            )
+            self._held = JournalStall(commands, fault, now, self._core_now(now), now)
             return
         self._act_on(commands, stored, now)
 
-    def _write_held(self, held: JournalStall, now: float) -> bool:
-        """Retry to write the commands of a journal stall; return False if that fails again."""
-        if now - held.tried < _TRY_AGAIN:
-            return False
-        held.tried = now
+    def _end_stall(self, held: JournalStall, now: float) -> bool:
+        """Return True after the commands of a journal stall have become durable."""
         length = now - held.since
         back = Record(
             EventKind.JOURNAL_BACK,
-            message=f"for {length:.1f} s nothing was decided: {held.reason}",
+            message=f"for {length:.1f} s nothing was decided: {held.fault.public}",
             facts={"seconds": round(length, 1)},
         )  # fmt: skip
         try:
-            stored = self._write([back, *held.commands])
+            if held.is_late:
+                stored = self._writer.outcome()
+            elif now - held.tried >= _TRY_AGAIN:
+                held.tried = now
+                stored = self._write([back, *held.commands])
+            else:
+                return False
         except JournalBlocked as fault:
-            held.reason = fault.public
+            held.fault = fault
             return False
         self._held, self._behind = None, now - held.core_now
+        self._endpoint.load.note_write(length)
         self._endpoint.events[:0] = held.waiting()
         self._act_on(held.commands, stored, now)
+        if held.refuses and not any(one.record.kind is EventKind.JOURNAL_BACK for one in stored):
+            self._carry_out([back], now)
         return True
 
     def _core_now(self, now: float) -> float:
@@ -541,7 +559,7 @@ class MasterRuntime:
             return ()
         begun = self._now()
         try:
-            return self._journal.write(records, intents, begun - self._started)
+            return self._writer.write(records, intents, begun - self._started)
         finally:
             self._endpoint.load.note_write(self._now() - begun)
 

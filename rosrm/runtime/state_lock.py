@@ -46,8 +46,8 @@ def closed_in_forks(lock: int) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[None]:
-    """Lock a state directory for one process of a role on this machine.
+def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[int]:
+    """Lock a state directory for one process of a role on this machine; yield the descriptor.
 
     Args:
         directory: created if it is missing; an existing one that is open to others is tightened.
@@ -81,7 +81,7 @@ def only_one(directory: Path, role: str, *, code: str, remedy: str) -> Iterator[
             raise Refused(_refusal(lock, directory, role, remedy), code) from None
         with contextlib.suppress(OSError):  # a full disk: only a refusal's message lacks the pid
             os.pwrite(lock.fileno(), str(os.getpid()).ljust(_PID_BYTES).encode(), 0)
-        yield
+        yield lock.fileno()
 
 
 def _refusal(lock: TextIO, directory: Path, role: str, remedy: str) -> str:

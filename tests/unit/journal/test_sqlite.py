@@ -480,3 +480,24 @@ def test_a_journal_in_a_directory_that_refuses_a_look_is_blocked_and_no_crash(
     error = fault_of(tmp_path / "j.sqlite", sqlite3.OperationalError("unable to open database"))
     assert isinstance(error, JournalBlocked)
     assert "check owner and permissions" in str(error)
+
+
+def test_only_the_answered_groups_are_moved_out_of_the_log(path, opened) -> None:
+    """A checkpoint waits for the disk, so no commit makes one. The log stays within its bound."""
+    journal = opened()
+    log, empty = path.with_name("journal.sqlite-wal"), path.stat().st_size
+    values = iter(range(1000))
+
+    def commit() -> None:
+        number = next(values)
+        journal.commit([], [Intent("process", f"p{number}", {"x": "y" * 200_000})], 0.0)
+
+    while not journal.is_untidy:
+        commit()
+    assert log.stat().st_size > 4 << 20
+    assert path.stat().st_size == empty
+    journal.tidy()
+    assert path.stat().st_size > 3 << 20
+    commit()
+    assert not journal.is_untidy
+    assert log.stat().st_size == 4 << 20

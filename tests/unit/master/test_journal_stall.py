@@ -9,8 +9,10 @@ import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Record
+from rosrm.errors import JournalBlocked
 from rosrm.master import journal_stall
 from rosrm.master.journal_stall import JournalStall
+from rosrm.master.journal_writer import JournalLate
 from rosrm.model.values import InstanceId
 from tests.unit.core.cluster import Cluster, process
 
@@ -33,12 +35,15 @@ DROPPED = {
 
 
 def still(now: float = 100.0) -> JournalStall:
-    return JournalStall([Record("n")], "the disk is full", since=5.0, core_now=now, tried=5.0)
+    fault = JournalBlocked("the disk is full")
+    return JournalStall([Record("n")], fault, since=5.0, core_now=now, tried=5.0)
 
 
-def take(held: JournalStall, *events: happened.Event, cluster: Cluster | None = None) -> list:
+def take(
+    held: JournalStall, *events: happened.Event, cluster: Cluster | None = None, now: float = 5.0
+) -> list:
     replies: list = []
-    held.take((cluster or Cluster()).state, events, replies.append)
+    held.take((cluster or Cluster()).state, events, replies.append, now)
     return replies
 
 
@@ -59,6 +64,29 @@ def test_requests_are_turned_away_with_the_reason() -> None:
     assert (reply.request, reply.accepted, reply.code) == (7, False, "journal")
     assert "the disk is full" in reply.message
     assert held.waiting() == []
+
+
+def test_requests_are_held_while_a_write_is_slow() -> None:
+    """After 5 s all of them are refused; what happened stays in order."""
+    held = still()
+    held.fault = JournalLate("the disk has not answered")
+    events = [statuses(1), happened.CancelRequested(7, ("p",)), statuses(2)]
+    assert take(held, *events, now=9.9) == []
+    assert held.waiting() == events
+    assert not held.refuses
+    replies = take(held, happened.CancelRequested(8, ("p",)), statuses(3), now=10.0)
+    assert [reply.request for reply in replies] == [7, 8]
+    assert held.waiting() == [statuses(1), statuses(2), statuses(3)]
+    assert held.refuses
+
+
+def test_held_requests_are_refused_once_the_write_has_failed() -> None:
+    held = still()
+    held.fault = JournalLate("the disk has not answered")
+    take(held, happened.CancelRequested(7, ("p",)))
+    held.fault = JournalBlocked("the disk is full")
+    (reply,) = take(held)
+    assert "the disk is full" in reply.message
 
 
 def test_what_happened_is_kept_in_order_and_of_requests_for_work_the_newest() -> None:
