@@ -13,8 +13,8 @@ import pytest
 
 from rosrm.core.supervisor import events
 from rosrm.core.supervisor.rules import LimitRule, RestartRule, StopRule
+from rosrm.runtime.file_thread import FileThread
 from rosrm.supervisor import confinement, endpoint, group_trees, messages, procfs, server
-from rosrm.supervisor.file_thread import FileThread
 from rosrm.supervisor.logs import LogLimits
 from rosrm.supervisor.spawn_into import fork_into
 from tests.failing_calls import nth_call_fails, uncounted
