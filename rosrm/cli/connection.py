@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import typer
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from rosrm.client.client import Client
     from rosrm.keys.roles import SecurityMode
     from rosrm.model.rows import Listing
+    from rosrm.model.values import ProcessSpec
     from rosrm.ros.master_connection import MasterClient
 
 #: Seconds from the start of the command until the message that no master answers. The command ends
@@ -53,6 +55,14 @@ def master(ctx: typer.Context, domain: int | None) -> Iterator[Client]:
 def note(text: str) -> None:
     """Print a sentence about the progress of the command to standard error."""
     echo(f"rosrm: {text}", err=True)
+
+
+def warn_of_files(specs: Iterable[ProcessSpec], path: str | Path) -> None:
+    """Print a warning for each process that will not find a file beside its work file."""
+    from rosrm.config.misplaced_files import misplaced_files  # noqa: PLC0415 - only with processes
+
+    for text in misplaced_files(specs, path):
+        note(f"warning: {text}")
 
 
 def print_trouble(snapshot: Listing) -> None:

@@ -228,7 +228,7 @@ class SupervisorClient:
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,
             fence_rule(order.fence), order.last_contact, order.limits, order.secrets,
-            order.adoption, order.slots,
+            order.adoption, order.slots, order.files,
         )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:

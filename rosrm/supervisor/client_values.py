@@ -46,6 +46,7 @@ class LaunchOrder:
         adoption: the process that becomes the first run; None: the first run is started.
         slots: start once fewer than this number of other instances are active, that is, neither
             held nor ended; 0: start at once.
+        files: words of `argv` that should name files in the working directory.
     """
 
     instance: InstanceId
@@ -61,6 +62,7 @@ class LaunchOrder:
     secrets: Mapping[str, str] = field(default_factory=lambda: EMPTY)
     adoption: AdoptionRule | None = None
     slots: int = 0
+    files: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -209,6 +209,7 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "kill_by": _optional_time,
     "withdrawn": bool,
     "adopted": bool,
+    "unfound": messages.read_text,
     "slots": lambda value: messages.read_whole(value, 0),
     "peak_memory": messages.read_amount,
     "cpu_time": messages.read_amount,
@@ -216,9 +217,10 @@ _FIELD_READERS: Final[Mapping[str, Callable[[Any], Any]]] = {
     "message": messages.read_text,
 }
 #: Fields that may be missing in older records.
-_NEW_FIELDS: Final = frozenset(
-    {"adopted", "begun", "enforced", "fault", "fenced", "heard", "kill_by", "slots", "withdrawn"}
-)
+_NEW_FIELDS: Final = frozenset({
+    "adopted", "begun", "enforced", "fault", "fenced", "heard", "kill_by", "slots", "unfound",
+    "withdrawn",
+})  # fmt: skip
 
 
 def _environment(identity: str, variables: Mapping[str, str]) -> dict[str, Any]:

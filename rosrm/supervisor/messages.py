@@ -10,7 +10,8 @@ The client sends orders; the key `do` names the order:
     environment  id, variables                  a base environment that later `start`s refer to
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo, limits,
-                 secrets, adoption, slots
+                 secrets, adoption, slots,
+                 files
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
@@ -24,6 +25,8 @@ The client sends orders; the key `do` names the order:
                                                 that runs and becomes the first run
                                                 slots: start once fewer than this number of others
                                                 are neither held nor ended; 0: start at once
+                                                files: words of argv that should name files in
+                                                the directory
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -140,6 +143,7 @@ class Launch(NamedTuple):
     secrets: Mapping[str, str] = MappingProxyType({})
     adoption: AdoptionRule | None = None
     slots: int = 0
+    files: tuple[str, ...] = ()
 
     def amended(self, amendment: Amend) -> Launch:
         """Return this launch as it is after an amendment."""
@@ -290,6 +294,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         read_texts(fields.get("secrets", {})),
         _adoption(fields.get("adoption")),
         read_whole(fields.get("slots", 0), 0),  # not sent by clients of an earlier version
+        tuple(read_text(word) for word in fields.get("files", ())),  # nor these
     )
 
 

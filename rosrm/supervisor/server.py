@@ -15,7 +15,7 @@ import signal
 import socket
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
@@ -470,7 +470,9 @@ class Server:
             traced = start_trace.stamped_in(environment, spawned=clocks.wall_time_ns())
             stamps = traced[start_trace.VARIABLE]
         self._logs.watch(key, clocks.boot_time(), pid)
-        self._happened(Spawned(key, pid, enforced, note.replace(self._state, "STATE")))
+        unfound = _unfound(start.attempt.unfound, self._launches[key].directory)
+        note = note.replace(self._state, "STATE")
+        self._happened(Spawned(key, pid, enforced, note, unfound=unfound))
         return stamps
 
     def _adopt(self, key: Key, launch: messages.Launch, rule: AdoptionRule) -> None:
@@ -517,8 +519,9 @@ class Server:
         environment = start_trace.stamped_in(self._environment(launch), recorded=recorded)
         directory = launch.directory or paths.work_directory(self._state)
         return spawn.Program(
-            launch.argv, environment, directory, launch.secrets, launch.limits.nice, self._files
-        )
+            launch.argv, environment, directory, launch.secrets, launch.limits.nice, self._files,
+            launch.files,
+        )  # fmt: skip
 
     def _environment(self, launch: messages.Launch) -> dict[str, str]:
         base = self._environments.get(launch.environment)
@@ -787,6 +790,22 @@ def _guarded(call: Callable[..., None], *args: object) -> None:
     except Exception as fault:  # noqa: BLE001 - see above
         own_log.write_fault(f"a part of the loop failed: {fault}")
         time.sleep(PAUSE_AFTER_FAULT)
+
+
+def _unfound(words: Sequence[str], directory: str | None) -> str:
+    """Return a sentence on files that did not exist at a start; "": there are none.
+
+    Args:
+        directory: the `working_directory` of the process; None: that of the supervisor.
+    """
+    where = (
+        "a directory of rosrm's own, because it has no `working_directory` (`.` is the folder of "
+        "its file)"
+        if directory is None
+        else f"its `working_directory`, {directory!r}"
+    )
+    named = " and ".join(map(repr, words))
+    return f"there was no {named} in {where}" if words else ""
 
 
 def _open_null() -> int:

@@ -9,6 +9,7 @@ the child, which names the step that the child is at. A successful exec closes t
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import resource
 import selectors
@@ -31,7 +32,7 @@ PATIENCE: Final = 10.0
 #: Bytes of one read of a report.
 _PART: Final = 1 << 16
 #: First letters of the messages in a report; a NUL byte ends each.
-_STEP, _FAULT, _TRANSIENT_FAULT, _NO_SCHEDULE, _NO_GROUP = "@!~sg"
+_STEP, _FAULT, _TRANSIENT_FAULT, _NO_SCHEDULE, _NO_GROUP, _UNFOUND = "@!~sgu"
 #: Descriptor of the report in the child, the first one behind the standard ones.
 _REPORT: Final = 3
 
@@ -52,6 +53,7 @@ class Program(NamedTuple):
         secrets: variable to the path of the file with its value.
         nice: niceness; 0: that of this process. Without the right to it, that of this process.
         files: soft limit of open descriptors; None: that of this process.
+        named: words of `argv` that should name files in the directory.
     """
 
     argv: tuple[str, ...]
@@ -60,6 +62,7 @@ class Program(NamedTuple):
     secrets: Mapping[str, str] = {}
     nice: int = 0
     files: int | None = None
+    named: tuple[str, ...] = ()
 
 
 class Attempt:
@@ -101,6 +104,11 @@ class Attempt:
         """Return the subject of a sentence about the path that the process waits for."""
         return next((text for kind, text in reversed(self._messages()) if kind == _STEP), "it")
 
+    @property
+    def unfound(self) -> tuple[str, ...]:
+        """Return the words of `Program.named` that name nothing in the working directory."""
+        return tuple(text for kind, text in self._messages() if kind == _UNFOUND)
+
     def check(self) -> None:
         """Raise the failure that the report has, if any.
 
@@ -113,7 +121,7 @@ class Attempt:
                 raise ScheduleRefused(text)
             if kind == _NO_GROUP:
                 raise OSError(int(text), os.strerror(int(text)))
-            if kind != _STEP:
+            if kind not in (_STEP, _UNFOUND):
                 raise SpawnError(text, transient=kind == _TRANSIENT_FAULT)
 
     def _messages(self) -> list[tuple[str, str]]:
@@ -233,6 +241,10 @@ def _execute(
     environment, directory = dict(program.environment), program.directory
     tell(_STEP, f"the working directory {directory!r}")
     _enter(directory)
+    for word in program.named:
+        tell(_STEP, f"the file {word!r} in its working directory {directory!r}")
+        if _is_missing(word):
+            tell(_UNFOUND, word)
     for name, path in program.secrets.items():
         tell(_STEP, f"the file {path!r} of the secret {name}")
         environment[name] = secret_files.read(name, path)
@@ -255,6 +267,14 @@ def _execute(
         raise SpawnError.of(reason, error) from None
     except ValueError as error:  # a NUL byte in an argument, a "=" in a variable's name
         raise SpawnError(f"{word!r} cannot be started: {error}") from None
+
+
+def _is_missing(path: str) -> bool:
+    try:
+        os.lstat(path)
+    except OSError as error:  # the program will meet any other fault, too
+        return error.errno in (errno.ENOENT, errno.ENOTDIR)
+    return False
 
 
 def _enter(directory: str) -> None:

@@ -71,6 +71,8 @@ def apply(  # noqa: PLR0917 - an argument for each option
     from rosrm.config.work import load_application
 
     targets = [load_application(file) for file in files]
+    for file, target in zip(files, targets, strict=True):
+        connection.warn_of_files(target.specs, file)
     kept = planned.read_plan(as_planned)
 
     def prepare(client: Client) -> Request:

@@ -74,7 +74,10 @@ def submit(
     if as_json and wait:
         raise ConfigError("submit: --wait prints no JSON; omit --wait or --json")
     limit = longest(timeout)
-    specs = [spec for file in files for spec in load_work(file)]
+    work = {file: load_work(file) for file in files}
+    specs = [spec for file in files for spec in work[file]]
+    for file, parts in work.items():
+        connection.warn_of_files(parts, file)
     left = "the submitted processes stay queued or run (`rosrm ps`)"
     with connection.master(ctx, domain) as client:
         if trace:

@@ -132,6 +132,7 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
     from rosrm.config.documents import read
     from rosrm.config.host import checked_host
     from rosrm.config.kinds import kind_of
+    from rosrm.config.misplaced_files import misplaced_files
     from rosrm.config.modes import checked_modes
     from rosrm.config.work import checked_work
     from rosrm.core.master.graph_names import node_of, shared_nodes
@@ -163,7 +164,8 @@ def _checked(file: Path, kind: KindOfFile | None, registry: Registry) -> str:
             target = checked_work(root, file, registry)
             specs = target.specs
             shared = shared_nodes((spec.name, node_of(spec)) for spec in specs)
-            for warning in (*shared, *_unknown_dependencies(specs)):
+            astray = misplaced_files(specs, file)
+            for warning in (*shared, *_unknown_dependencies(specs), *astray):
                 echo(f"{file}: warning: {warning}", err=True)
             jobs = sum(spec.kind.value == "job" for spec in specs)
             numbers = ((jobs, "job"), (len(specs) - jobs, "service"))

@@ -78,6 +78,7 @@ def run(  # noqa: PLR0913, PLR0917 - an argument for each option
         environment=pairs_of("--env", env or [], "NAME=VALUE"), time_limit=time_limit,
         directory=directory,
     )  # fmt: skip
+    connection.warn_of_files([spec], "run")
     if any(not word or word.startswith("=") for word in on or []):
         raise ConfigError("--on: give the name of a host, or LABEL=VALUE")
     with connection.master(ctx, domain) as client:

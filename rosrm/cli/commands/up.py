@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import typer
 
+from rosrm.cli import connection
 from rosrm.cli.commands.runtimes import with_domain
 from rosrm.cli.options import CommonOptions, Domain
 from rosrm.wording import reason_of
@@ -93,6 +94,8 @@ def up(  # noqa: PLR0917 - an argument for each option
     settings = _settings(file, registry)
     ros = with_domain(_local(settings.ros, discovery), ctx, domain)
     work = [checked_work(read(name), name, registry) for name in files or []]
+    for name, target in zip(files or [], work, strict=True):
+        connection.warn_of_files(target.specs, name)
     directory = (state or _temporary_directory()).absolute()
     with cleaned(directory, keep=state is not None):
         cluster = UpCluster(

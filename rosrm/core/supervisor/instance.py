@@ -66,13 +66,14 @@ class Instance:
             master decides on its restart, because the machine was restarted.
         slots: it starts once fewer than this number of others are active; 0: it is never held.
         adopted: its last run was started without rosrm, so its exit code is never known.
+        unfound: text on files of its command that did not exist at its last start; "": none.
     """
 
     __slots__ = (
         "adopted", "begun", "cpu_time", "deadline", "enforced", "exit_code", "exit_signal", "fault",
         "fence", "fenced", "heard", "key", "kill_by", "kills", "message", "peak_memory",
         "phase", "pid", "recent", "restart", "restarts", "run_time", "slots", "started",
-        "step", "stop", "stop_began", "then", "trail", "withdrawn",
+        "step", "stop", "stop_began", "then", "trail", "unfound", "withdrawn",
     )  # fmt: skip
 
     def __init__(self, key: Key, restart: RestartRule, stop: StopRule) -> None:
@@ -85,6 +86,7 @@ class Instance:
         self.kill_by: float | None = None
         self.withdrawn = False
         self.adopted = False
+        self.unfound = ""
         self.slots = 0
         self.phase: Phase = STARTING
         self.then: Then = ""
@@ -163,7 +165,8 @@ def ending(instance: Instance) -> str:
         return "ended; its exit code is not known, because rosrm did not start this run"
     if instance.exit_code == UNKNOWN_EXIT:
         return "ended while its host or its supervisor was down: its exit code is not known"
-    return ending_of(instance.exit_code)
+    hint = f"; {instance.unfound}" if instance.exit_code and instance.unfound else ""
+    return ending_of(instance.exit_code) + hint
 
 
 def killed_for_memory(used: float, limit: float) -> str:

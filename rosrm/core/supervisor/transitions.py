@@ -56,6 +56,7 @@ def _spawned(instance: Instance, event: events.Event, now: float) -> list[Comman
     instance.message, instance.fault = event.note, ""
     instance.enforced = event.enforced
     instance.adopted = event.adopted
+    instance.unfound = event.unfound
     if instance.then == THEN_END:
         return _stop(instance, event, now)
     return [ReportStatus(instance.key)]

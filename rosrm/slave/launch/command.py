@@ -15,6 +15,7 @@ from rosrm.core.supervisor.rules import AdoptionRule
 from rosrm.errors import LaunchError
 from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION, Adoption
+from rosrm.model.relative_files import relative_files
 from rosrm.model.values import Assignment, InstanceId, ProcessSpec, RestartPolicy
 from rosrm.runtime import durable
 from rosrm.runtime.path_calls import at
@@ -96,6 +97,7 @@ def order_of(plain: Launch, launchers: Launchers, host: str) -> LaunchOrder:
         limits=limit_rule(spec),
         secrets=spec.secrets,
         adoption=_adoption(spec.adoption, host),
+        files=relative_files(spec),
     )
 
 

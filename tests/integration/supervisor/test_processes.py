@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import time
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -44,6 +45,23 @@ def test_exit_status_usage_and_output_are_kept(host, client):
     assert 0 < status.run_time < 10
     assert status.peak_memory > 0
     assert host.log("short").read_text() == "out\nerr\n"
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_file_that_its_working_directory_lacks_is_named_with_the_failure(
+    host, client, tmp_path, given
+):
+    """The program may say no more than "exit code 2", and the directory is of rosrm's choice."""
+    (tmp_path / "there.py").touch()
+    words = ("sh", "-c", "exit 2", "./x.py", "there.py")
+    order = host.order("lost", *words, working_directory=str(tmp_path) if given else None)
+    status = host.run(client, replace(order, files=("./x.py", *(["there.py"] if given else []))))
+    where = (
+        f"its `working_directory`, '{tmp_path}'"
+        if given
+        else "a directory of rosrm's own, because it has no `working_directory`"
+    )
+    assert status.message.startswith(f"exit code 2; there was no './x.py' in {where}")
 
 
 def test_many_short_processes_at_once_leave_the_supervisor_alive(host, client):

@@ -242,6 +242,28 @@ def test_a_resource_that_no_probe_here_measures_is_no_mistake(check):
     assert check("processes: [{name: a, command: x, needs: {gpu_memory: 1}}]").err == ""
 
 
+@pytest.mark.parametrize(
+    ("command", "directory", "said"),
+    [
+        ("[python3, ./x.py]", "", "runs in a directory of its host; with `working_directory: .`"),
+        ("bash conf/run.sh", "/usr", "runs in /usr; with `working_directory: .` it runs in the"),
+        ("bash conf/run.sh", ".", ""),
+        ("[python3, ./none.py]", "", ""),
+    ],
+)
+def test_a_file_that_only_the_folder_of_the_work_file_has_is_a_warning(
+    rosrm, client, check, file, tmp_path, command, directory, said
+):
+    """The same warning comes before the submission."""
+    (tmp_path / "conf").mkdir()
+    file("", "x.py"), file("", "conf/run.sh")
+    given = f", working_directory: {directory}" if directory else ""
+    text = f"processes: [{{name: a, command: {command}{given}}}]"
+    for result in (check(text), rosrm("submit", file(text))):
+        assert result.code == 0
+        assert (said in result.err and "warning: a: '" in result.err) if said else not result.err
+
+
 def test_a_dependency_that_is_not_in_the_file_is_a_warning(check):
     """The master may know the process; a misspelt name is found before the submission."""
     result = check(
