@@ -129,7 +129,7 @@ def test_the_bound_leaves_what_a_restart_needs(host):
     with host.log("waits", 2).open("ab") as log:
         log.write(bytes(10 * KIB))
     client = host.connect(log=limits)
-    up: set[int] = set()
+    up = {one.instance.number for one in client.instances if one.state is InstanceState.RUNNING}
     wait_until(
         lambda: up.update(
             one.instance.number for one in client.receive(1.0) if one.state is InstanceState.RUNNING
