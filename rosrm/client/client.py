@@ -341,11 +341,24 @@ class Client:
 
     def explain(self, process: str) -> Mapping[str, Any]:
         """Return the reasons for a process's placement or wait, as `rosrm explain --json`."""
+        return self._explained(process, lambda: self.get_process(process))
+
+    def explain_host(self, host: str) -> Mapping[str, Any]:
+        """Return why processes have to leave a host, and why they do not.
+
+        The member `reasons` has a sentence for its drain and for each limit that is exceeded.
+        """
+        from rosrm.model.rows import HOST_MARK  # noqa: PLC0415 - loads with the first listing
+
+        return self._explained(f"{HOST_MARK}{host}", lambda: self.get_host(host))
+
+    def _explained(self, name: str, look_up: Callable[[], object]) -> Mapping[str, Any]:
+        """Return an explanation; `look_up` refuses an unknown name, and names the nearest."""
         try:
-            return self._master.explain(process)
+            return self._master.explain(name)
         except Refused as refusal:
             if refusal.code == "unknown":
-                self.get_process(process)  # names the nearest
+                look_up()
             raise
 
     # --- events and logs -----------------------------------------------------------------

@@ -10,6 +10,7 @@ from typing import Any, Final
 from rosrm.core.master import listing
 from rosrm.core.master.applications.listing import application_rows
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.migration.host_explanation import host_explanation
 from rosrm.core.master.modes.switching import mode_rows
 from rosrm.core.master.state.hosts import Host
 from rosrm.journal.sqlite import SqliteJournal
@@ -18,7 +19,7 @@ from rosrm.master.disclosure import disclosed
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.records import StoredRecord
 from rosrm.model.requester import Requester
-from rosrm.model.rows import EventRow, Listing, PluginRow, ProcessRow
+from rosrm.model.rows import HOST_MARK, EventRow, Listing, PluginRow, ProcessRow
 from rosrm.model.values import LARGEST_NUMBER
 from rosrm.wording import first_line
 
@@ -130,7 +131,15 @@ class MasterQueries:
         return rows
 
     def explain(self, name: str, by: Requester) -> str | None:
-        """Return the explanation of a process as JSON; None if the process is unknown."""
+        """Return the explanation of a process as JSON, or of a host; None if it is unknown.
+
+        Args:
+            name: of the process; of a host after "host:".
+        """
+        if name.startswith(HOST_MARK):
+            host = host_explanation(self._state, name.removeprefix(HOST_MARK), self._core_now())
+            plain = json.loads(json.dumps(host))
+            return json.dumps(disclosed(plain, details=by.is_operator)) if host else None
         explanation = listing.explanation(self._state, name, self._core_now())
         if explanation is None:
             return None

@@ -25,6 +25,9 @@ PROCESS_STATES: Final = (
     "unknown",
 )  # fmt: skip
 
+#: Beginning of a name in a request for an explanation: a host of this name, not a process.
+HOST_MARK: Final = "host:"
+
 
 @dataclass(frozen=True, slots=True)
 class ResourceRow:
@@ -81,6 +84,12 @@ class HostRow:
     processes: int
     drained: bool = False
     devices: tuple[DeviceRow, ...] = ()
+
+    @property
+    def must_be_left(self) -> bool:
+        """Return True if processes have to leave the host: it is over a limit, or is drained."""
+        over = any(one.usage >= one.limit and not one.stale for one in self.resources)
+        return (self.state == "up" and over) or (self.draining and self.processes > 0)
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final
+from collections.abc import Iterable, Mapping
+from itertools import chain
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
 import typer
 
@@ -13,6 +15,15 @@ from rosrm.cli import connection
 from rosrm.cli.options import Application, Array, AsJson, Domain, Name, host_option
 from rosrm.cli.output.plain import echo
 from rosrm.client.connecting import check_name
+from rosrm.errors import Refused
+from rosrm.wording import few
+
+if TYPE_CHECKING:
+    from rosrm.client.client import Client
+    from rosrm.model.rows import HostRow
+
+#: Most hosts of which one listing explains why processes have to leave them.
+_MOST_EXPLAINED: Final = 4
 
 
 def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -> None:
@@ -23,11 +34,12 @@ def status(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) -
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(hosts=True, processes=True, plugins="failing", events=True, newest=5)
+        to_leave = _to_leave(client, snapshot.hosts)
     connection.print_trouble(snapshot)
     if as_json:
-        json_forms.show(json_forms.status_form(snapshot))
+        json_forms.show({**json_forms.status_form(snapshot), "to_leave": to_leave})
     else:
-        show(overview.render(snapshot))
+        show(overview.render(snapshot, to_leave))
 
 
 def ps(  # noqa: PLR0917 - an argument for each option
@@ -79,12 +91,15 @@ def hosts(ctx: typer.Context, as_json: AsJson = False, domain: Domain = None) ->
 
     with connection.master(ctx, domain) as client:
         snapshot = client.list(hosts=True)
+        to_leave = [] if as_json else _to_leave(client, snapshot.hosts)
     connection.print_trouble(snapshot)
     rows = snapshot.hosts
     if as_json:
         json_forms.show(json_forms.forms(rows))
     elif rows:
         tables.show(tables.hosts(rows))
+        for sentence in to_leave:
+            echo(f"\n{sentence}")
     else:
         echo("no host; start `rosrm slave` on each")
 
@@ -123,19 +138,40 @@ def plugins(
 
 
 def explain(ctx: typer.Context, name: Name, as_json: AsJson = False, domain: Domain = None) -> None:
-    """Explain the placement of a process, or why it waits.
+    """Explain the placement of a process, or why it waits; or why a host must be left.
 
-    Lists each host with its score, its veto or the requirement that it does not meet, then the
-    newest events.
+    Of a process: lists each host with its score, its veto or the requirement that it does not meet,
+    then the newest events. Of a host over a limit or being drained: tells which processes leave it,
+    and why others do not.
     """
     from rosrm.cli.output import explain, json_forms, tables
 
     with connection.master(ctx, domain) as client:
-        explanation = client.explain(name)
+        explanation = _explanation(client, name)
     if as_json:
         json_forms.show(dict(explanation))
+    elif "of_host" in explanation:
+        echo("\n".join(explanation["reasons"]) or f"no process has to leave {name}")
     else:
         tables.show(explain.render(explanation))
+
+
+def _explanation(client: Client, name: str) -> Mapping[str, Any]:
+    """Return the explanation of a process, or of a host if no process has the name."""
+    try:
+        return client.explain(name)
+    except Refused as refusal:
+        if refusal.code == "unknown" and name in {h.description.name for h in client.list_hosts()}:
+            return client.explain_host(name)
+        raise
+
+
+def _to_leave(client: Client, hosts: Iterable[HostRow]) -> list[str]:
+    """Return sentences on the hosts that processes have to leave, of at most `_MOST_EXPLAINED`."""
+    concerned = [row.description.name for row in hosts if row.must_be_left]
+    found = [client.explain_host(name)["reasons"] for name in concerned[:_MOST_EXPLAINED]]
+    others = ", ".join(few(concerned[_MOST_EXPLAINED:]))
+    return [*chain(*found), *([f"`rosrm explain HOST` explains {others}"] if others else [])]
 
 
 COMMANDS: Final = (status, ps, hosts, plugins, explain)

@@ -18,12 +18,16 @@ _TROUBLE = ("stuck", "unreachable", "unknown", "failed", "set_aside", "backoff")
 _MOST_NAMED = 5
 
 
-def render(snapshot: Listing) -> RenderableType:
-    """Return the overview of a listing with hosts, processes and the newest events."""
-    return Group(*_lines(snapshot))
+def render(snapshot: Listing, to_leave: Sequence[str] = ()) -> RenderableType:
+    """Return the overview of a listing with hosts, processes and the newest events.
+
+    Args:
+        to_leave: sentences on the hosts that processes have to leave.
+    """
+    return Group(*_lines(snapshot, to_leave))
 
 
-def _lines(snapshot: Listing) -> Iterator[RenderableType]:
+def _lines(snapshot: Listing, to_leave: Sequence[str]) -> Iterator[RenderableType]:
     yield Text(f"master     {snapshot.master}, up {duration(snapshot.uptime)}")
     if snapshot.security == "none":
         yield Text(
@@ -36,6 +40,7 @@ def _lines(snapshot: Listing) -> Iterator[RenderableType]:
     if snapshot.hosts:
         yield Text()
         yield tables.hosts(snapshot.hosts)
+    yield from _first([Text(one, style="yellow") for one in to_leave], "rosrm hosts")
     yield from _first(list(_troubles(snapshot.processes)), "rosrm ps")
     yield from _first(list(_failing(snapshot.plugins)), "rosrm plugins")
     if snapshot.events:

@@ -10,7 +10,16 @@ from typer.testing import CliRunner
 
 from rosrm.cli import connection
 from rosrm.cli.command_tree import app
-from rosrm.model.rows import EventRow, HostRow, Listing, PluginRow, ProcessRow, ResourceRow
+from rosrm.errors import Refused
+from rosrm.model.rows import (
+    HOST_MARK,
+    EventRow,
+    HostRow,
+    Listing,
+    PluginRow,
+    ProcessRow,
+    ResourceRow,
+)
 from rosrm.model.values import HostDescription
 
 NAN = float("nan")
@@ -87,6 +96,8 @@ class FakeClient:
     strangers: str = ""
     asked: list = field(default_factory=list)
     fails: BaseException | None = None
+    unknown: set = field(default_factory=set)  # names of no process
+    to_leave: list = field(default_factory=list)  # sentences on a host that must be left
     waits: tuple = ()  # seconds without an answer, before each listing
     settings: object = None
     closed: bool = False
@@ -132,6 +143,10 @@ class FakeClient:
         return "removed"
 
     def explain(self, name):
+        if name.startswith(HOST_MARK):
+            return {"of_host": name.removeprefix(HOST_MARK), "over": {}, "reasons": self.to_leave}
+        if name in self.unknown:
+            raise Refused(f"no such process: {name}", "unknown")
         self._note("explain", name)
         return STORY
 

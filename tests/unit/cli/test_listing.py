@@ -38,6 +38,27 @@ def test_status_shows_the_cluster_on_half_a_page(rosrm, client):
     assert "talker goes to alpha" in result.out
 
 
+@pytest.mark.parametrize("command", ["status", "hosts"])
+def test_a_host_that_processes_have_to_leave_is_explained(rosrm, client, command):
+    """Four hosts, because each explanation is a request."""
+    client.to_leave = ["it is over its limit of memory: nothing can leave it"]
+    client.hosts = [host("fine", resources=[resource("memory")])]
+    assert "over its limit" not in rosrm(command).out
+    client.hosts = [host(f"h{n}") for n in range(6)]
+    out = " ".join(rosrm(command).out.split())
+    assert out.count(client.to_leave[0]) == 4
+    assert "`rosrm explain HOST` explains h4, h5" in out
+
+
+def test_explain_takes_a_host_if_no_process_has_the_name(rosrm, client):
+    client.unknown = {"alpha"}
+    client.to_leave = ["alpha is being drained: p leaves"]
+    assert rosrm("explain", "alpha").out == "alpha is being drained: p leaves\n"
+    assert json.loads(rosrm("explain", "alpha", "--json").out)["of_host"] == "alpha"
+    client.to_leave = []
+    assert rosrm("explain", "alpha").out == "no process has to leave alpha\n"
+
+
 def test_hosts_with_devices_show_the_free_ones(rosrm, client):
     """Shares of units count; missing units are named, and only listed in a column of their own."""
     assert "DEVICES" not in rosrm("hosts").out
@@ -62,7 +83,7 @@ def test_hosts_with_devices_show_the_free_ones(rosrm, client):
 def test_status_json_counts_states(rosrm, client):
     assert json.loads(rosrm("status", "--json").out) == {
         "master": "lab", "uptime": 125.0, "last_sequence": 2, "trouble": "", "security": "keys",
-        "strangers": "",
+        "strangers": "", "to_leave": [],
         "hosts": {"up": 2, "suspect": 1}, "failing_plugins": [],
         "processes": {"running": 1, "queued": 1, "failed": 1, "finished": 1},
     }  # fmt: skip

@@ -8,7 +8,7 @@ has room, no process moves.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Final
@@ -133,25 +133,38 @@ def _evict(state: MasterState, host: Host, now: float) -> None:
 
 def _evict_for_resource(state: MasterState, host: Host, resource: str, now: float) -> bool:
     """Begin to move one process; return False, and record why, if none can leave."""
-    reasons, largest = [], _largest_first(state, host, resource)
+    reasons = []
+    for name, planned in evictions(state, host, resource, now):
+        if isinstance(planned, PlannedMoves):
+            begin_moves(state, planned, now)
+            return True
+        reasons.append((name, planned.reason))
+    _record_nothing_moves(state, host, resource, reasons, now)
+    return False
+
+
+def evictions(
+    state: MasterState, host: Host, resource: str, now: float
+) -> Iterator[tuple[str, PlannedMoves | Rejected]]:
+    """Yield the processes of a host, the largest users of a resource first, with moves or reasons.
+
+    The name "" stands for all of them.
+    """
+    largest = _largest_first(state, host, resource)
     if largest and not any(_accounts_for(instance, resource) for instance in largest):
         # Without their names, because each new process would cause another record.
-        reasons = [("", f"no process on it declares a need of {resource}, {_UNMEASURED}")]
-        largest = []
+        yield "", Rejected(f"no process on it declares a need of {resource}, {_UNMEASURED}")
+        return
     for instance in largest:
         process = state.processes[instance.id.process]
         reason = _why_not_now(state, process, instance, resource, now)
-        if not reason:
-            rejected = try_move(
-                state, process, f"{host.name} is over its limit of {resource}", now,
-                headroom=state.settings.headroom,
-            )  # fmt: skip
-            if rejected is None:
-                return True
-            reason = rejected.reason
-        reasons.append((process.name, reason))
-    _record_nothing_moves(state, host, resource, reasons, now)
-    return False
+        cause, headroom = f"{host.name} is over its limit of {resource}", state.settings.headroom
+        planned = (
+            Rejected(reason)
+            if reason
+            else plan_moves(state, process, cause, now, headroom=headroom)
+        )
+        yield process.name, planned
 
 
 def _largest_first(state: MasterState, host: Host, resource: str) -> list[Instance]:
