@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import FrameType
-from typing import Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from rosrm import clocks
 from rosrm.cli.connection import note
@@ -16,7 +16,7 @@ from rosrm.cli.output.log_lines import LogStream, show
 from rosrm.cli.waiting import show_change
 from rosrm.client.client import Client
 from rosrm.client.logs import PERIOD, LogReader, LogSelection
-from rosrm.client.retrying import ask_until_answered
+from rosrm.client.retrying import ask_until_answered, deadline_after
 from rosrm.client.waiting import ENDED
 from rosrm.errors import NoMaster, Refused
 from rosrm.model.rows import ProcessRow
@@ -24,6 +24,11 @@ from rosrm.model.values import ProcessSpec
 from rosrm.ros.deferred_signals import signals_deferred
 from rosrm.runtime.dispositions import handled
 from rosrm.wording import standing
+
+if TYPE_CHECKING:
+    from rosrm.ros.master_connection import OnWait
+
+T = TypeVar("T")
 
 #: Seconds in the queue after which the command says why the job waits.
 _PATIENCE: Final = 1.0
@@ -37,13 +42,21 @@ _FAILED: Final = 1
 _SIGNALLED: Final = 128
 
 
-def run_job(client: Client, spec: ProcessSpec) -> int:
+def run_job(client: Client, spec: ProcessSpec, patience: float | None) -> int:
     """Submit a job, copy its output until it has ended, and return its exit code.
 
     SIGINT and SIGTERM cancel the job, and then the command waits for its end; a second signal ends
     the command at once.
+
+    Args:
+        client: asks the master.
+        spec: of the job.
+        patience: seconds of silence of the master after which the command ends; None: no bound.
+
+    Raises:
+        NoMaster: the master was silent for so long; the job may still run.
     """
-    job = _Job(client, spec.name)
+    job = _Job(client, spec.name, patience)
     with _signals(job):
         try:
             with signals_deferred():
@@ -56,8 +69,7 @@ def run_job(client: Client, spec: ProcessSpec) -> int:
         except KeyboardInterrupt:
             pass
         try:
-            job.cancel()
-            if job.is_queued and job.signal != signal.SIGHUP:  # a closed terminal takes no output
+            if job.cancel() and job.signal != signal.SIGHUP:  # a closed terminal takes no output
                 job.follow()
         except KeyboardInterrupt:
             note(
@@ -85,12 +97,14 @@ class _Job:
     """The submitted job.
 
     Attributes:
+        patience: seconds of silence of the master after which a wait for it fails; None: no bound.
         is_queued: the master has accepted the job. Otherwise its name may be another process's.
         signal: number of the signal that interrupted the command; 0: none.
     """
 
     client: Client
     name: str
+    patience: float | None = None
     is_queued: bool = False
     signal: int = 0
     _reader: LogReader = field(init=False)
@@ -103,14 +117,23 @@ class _Job:
         self._reader.notify = _ignore
         self._stream = LogStream(self.name)
 
-    def cancel(self) -> None:
-        """Cancel the job, unless it has ended or was never queued."""
+    def cancel(self) -> bool:
+        """Cancel the job, unless it has ended or was never queued; return True if it will end."""
         if not self.is_queued:
-            return
-        with suppress(Refused):
+            return False
+        text = f"cancelling {self.name}; Ctrl-C again leaves at once"
+        try:
             self.client.cancel(self.name)
+        except Refused:
+            pass  # it has ended
+        except NoMaster:
+            text = (
+                f"the master does not answer, so {self.name} is not cancelled; once the master "
+                f"runs again, `rosrm cancel {self.name}` ends it"
+            )
         with suppress(OSError):  # a closed terminal
-            note(f"cancelling {self.name}; Ctrl-C again leaves at once")
+            note(text)
+        return text.startswith("cancelling")
 
     def follow(self) -> int:
         """Copy the output of the job until it has ended; return the exit code."""
@@ -126,10 +149,18 @@ class _Job:
                 time.sleep(PERIOD)
 
     def _row(self) -> ProcessRow | None:
-        view = ask_until_answered(
-            lambda on_wait: self.client.list(processes=True, on_wait=on_wait), note
-        )
+        try:
+            view = self._ask(lambda on_wait: self.client.list(processes=True, on_wait=on_wait))
+        except NoMaster as error:
+            raise NoMaster(
+                f"no longer waiting for {self.name}, which may still run: `rosrm logs -f "
+                f"{self.name}` follows it once the master runs again. {error}"
+            ) from None
         return next((row for row in view.processes if row.name == self.name), None)
+
+    def _ask(self, look: Callable[[OnWait], T]) -> T:
+        """Return an answer of the master; raise `NoMaster` after a silence of `patience`."""
+        return ask_until_answered(look, note, deadline_after(self.patience))
 
     def _copy(self, *, has_ended: bool) -> bool:
         """Copy new output; return False if there was none."""
@@ -167,7 +198,7 @@ class _Job:
         if row.state in _WAITING and clocks.boot_time() - self._since > _PATIENCE:
             if "waits" not in self._reported:
                 self._reported.add("waits")
-                story = ask_until_answered(lambda _: self.client.explain(self.name), note)
+                story = self._ask(lambda _: self.client.explain(self.name))
                 note(f"{self.name} waits for a host: {story['reason'] or 'no reason is known yet'}")
                 if row.state == "set_aside":
                     note("Ctrl-C cancels it; then run it again with other `--needs` or `--on`")

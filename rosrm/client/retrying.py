@@ -22,6 +22,8 @@ Notify = Callable[[str], None]
 PERIOD: Final = 0.5
 #: Seconds without an answer after which a message says so; a busy master may need one second.
 _SILENCE: Final = 2.0
+#: Seconds of further silence after which another message says so.
+_STILL: Final = 30.0
 
 
 def deadline_after(timeout: float | None) -> float:
@@ -37,23 +39,29 @@ def ask_until_answered(
     Args:
         look: asks the master; raises `NoMaster` after some seconds without an answer. Its argument
             takes the seconds of a wait, repeatedly.
-        notify: takes a message when the silence begins, one with the places to check, and one when
-            the silence ends.
+        notify: takes a message when the silence begins, one with the places to check, one every 30
+            seconds of further silence, and one when the silence ends.
         deadline: monotonic seconds after which the silence is an error.
 
     Raises:
         NoMaster: the master was silent at the deadline.
         Refused: the master refuses what it is asked, or could not answer until the deadline.
     """
-    silent = failed = False
+    failed, began = False, clocks.boot_time()
+    asked = began
+    said = -math.inf  # seconds of silence at the last message about it
 
     def on_wait(seconds: float) -> None:
-        nonlocal silent
-        if seconds >= _SILENCE and not silent and clocks.boot_time() < deadline:
-            silent = True
-            notify(f"the master has not answered for {seconds:.0f} s; still waiting")
+        nonlocal said
+        silence = asked - began + seconds
+        is_due = silence >= _SILENCE and silence >= said + _STILL
+        if is_due and clocks.boot_time() < deadline:
+            said = silence
+            notify(f"the master has not answered for {silence:.0f} s; still waiting")
 
     while True:
+        asked = clocks.boot_time()
+        on_wait(0.0)
         try:
             answer = look(on_wait)
         except (NoMaster, Refused) as error:
@@ -61,10 +69,10 @@ def ask_until_answered(
             if is_final or clocks.boot_time() >= deadline:
                 raise
             if not failed:
+                failed, said = True, clocks.boot_time() - began
                 notify(f"{error} Asking again until the master answers")
-            silent = failed = True
             time.sleep(PERIOD)
         else:
-            if silent:
+            if said > -math.inf:
                 notify("the master answers again")
             return answer

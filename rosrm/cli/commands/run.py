@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from rosrm.cli import connection
-from rosrm.cli.options import Domain, pairs_of
+from rosrm.cli.options import Domain, pairs_of, seconds_of
 from rosrm.errors import ConfigError
 
 
@@ -62,13 +62,22 @@ def run(  # noqa: PLR0913, PLR0917 - an argument for each option
             help="Working directory on the host, e.g. `.`; default: one of rosrm's own.",
         ),
     ] = "",
+    patience: Annotated[
+        str,
+        typer.Option(
+            "--master-timeout", metavar="TIME",
+            help="Exit with 3 after the master was silent for this time; the job may go on then. "
+            "`never`: wait for the master without a bound.",
+        ),
+    ] = "10min",
     domain: Domain = None,
 ) -> None:  # fmt: skip
     """Run one job on a host, print its output here, and exit with its exit code.
 
     The job is queued as any other. Ctrl-C cancels it; a second Ctrl-C leaves it. The exit code is
-    that of the job, or 128 + the number of the signal that ended it. Standard input is not
-    connected. Both output streams of the job arrive on the standard output.
+    that of the job, or 128 + the number of the signal that ended it; 3 if the master was silent for
+    `--master-timeout`. Standard input is not connected. Both output streams of the job arrive on
+    the standard output.
     """
     from rosrm.cli.job_run import run_job
     from rosrm.cli.job_spec import job_of, placed
@@ -78,8 +87,10 @@ def run(  # noqa: PLR0913, PLR0917 - an argument for each option
         environment=pairs_of("--env", env or [], "NAME=VALUE"), time_limit=time_limit,
         directory=directory,
     )  # fmt: skip
+    hint = ", or `never`"
+    longest = None if patience == "never" else seconds_of("--master-timeout", patience, hint=hint)
     connection.warn_of_files([spec], "run")
     if any(not word or word.startswith("=") for word in on or []):
         raise ConfigError("--on: give the name of a host, or LABEL=VALUE")
     with connection.master(ctx, domain) as client:
-        raise typer.Exit(run_job(client, placed(spec, on or [], client.list_hosts())))
+        raise typer.Exit(run_job(client, placed(spec, on or [], client.list_hosts()), longest))

@@ -8,7 +8,9 @@ import pytest
 
 from rosrm.cli import job_run
 from rosrm.cli.job_spec import job_of
+from rosrm.client import retrying
 from rosrm.client.client import Client
+from rosrm.errors import NoMaster
 from rosrm.model.rows import HostRow
 from rosrm.model.values import HostDescription, Kind
 
@@ -88,6 +90,7 @@ def test_the_default_name_is_the_program_with_a_suffix(program, stem):
         (["--name", "a/b", "ls"], 2, "--name: 'a/b' cannot be the name of a process"),
         (["--on", "shef", "ls"], 1, "no such host: 'shef'; did you mean 'shelf'?"),
         (["--on", "room=b", "ls"], 2, "--on room=b: no host has this label"),
+        (["--master-timeout", "long", "ls"], 2, "--master-timeout: "),
         (["--on", "", "ls"], 2, "--on: give the name of a host, or LABEL=VALUE"),
     ],
 )
@@ -104,6 +107,36 @@ def test_a_host_without_a_label_of_its_own_cannot_be_chosen(rosrm, cluster):
     result = rosrm("run", "--on", "shelf", "ls")
     assert result.code == 1
     assert "labels: {host: shelf}" in result.err
+
+
+@pytest.mark.parametrize("given", ["0.05s", "never"])
+def test_a_silent_master_ends_the_command_after_its_time(rosrm, cluster, monkeypatch, given):
+    """Ctrl-C ends it also without a time, and says that the job is not cancelled."""
+
+    def silent(*_words, **_more):
+        raise NoMaster("no answer.")
+
+    def interrupted(_seconds):
+        raise KeyboardInterrupt
+
+    submit = cluster.submit
+
+    def submit_and_die(specs):
+        monkeypatch.setattr(cluster, "list", silent)
+        monkeypatch.setattr(cluster, "cancel", silent)
+        return submit(specs)
+
+    monkeypatch.setattr(cluster, "submit", submit_and_die)
+    if given == "never":
+        monkeypatch.setattr(retrying.time, "sleep", interrupted)
+    result = rosrm("run", "--name", "one", "--master-timeout", given, "ls")
+    if given == "never":
+        assert "the master does not answer, so one is not cancelled" in result.err
+        assert result.code == 128
+        return
+    assert "Asking again until the master answers" in result.err
+    assert "no longer waiting for one, which may still run: `rosrm logs -f one`" in result.err
+    assert result.code == 3
 
 
 @pytest.mark.parametrize(
