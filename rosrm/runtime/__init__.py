@@ -10,6 +10,7 @@ disk_space.py      free space on the disk of a directory
 addresses.py       IPv4 addresses of the network interfaces
 settings_check.py  check of a settings file, in a process of its own
 parent_death.py    end of a process with its parent
+process_title.py   names of the parts in `ps -e`
 process_end.py     end of a process in which a plugin has left threads
 oom_score.py       protection of an agent from the OOM killer
 timer_slack.py     exact ends of the waits of a process

@@ -23,6 +23,7 @@ from rosrm.extensions.installed import PluginAddress, installed_plugins
 from rosrm.runtime import private_files
 from rosrm.runtime.dispositions import handle
 from rosrm.runtime.memory_file import memory_file
+from rosrm.runtime.process_title import show_role
 from rosrm.runtime.settings_check import SettingsSource
 from rosrm.wording import printable
 
@@ -179,6 +180,7 @@ def run(role: str, serve: Callable[[Handover], int]) -> int:
         serve: runs until a stop signal; the message of a `RosrmError` that it raises is printed.
     """
     private_files.set_private_umask()
+    show_role(role)
     # The starting process blocked SIGINT (see `interrupts_held`); from now on it ends this one.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     output = logging.StreamHandler(sys.stderr)

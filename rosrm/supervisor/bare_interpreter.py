@@ -19,11 +19,13 @@ def main() -> None:
 
     # ruff: noqa: PLC0415 - these can be imported only now
     from rosrm.runtime import file_thread, oom_score, timer_slack
+    from rosrm.runtime.process_title import show_role
     from rosrm.supervisor import descriptors, endpoint, own_log
     from rosrm.supervisor.logs import LogLimits
     from rosrm.supervisor.server import Server
 
     state, *limits = sys.argv[1:]
+    show_role("supervisor")
     file_thread.let_threads_wait()
     timer_slack.use_usual_timers()  # for the processes of users
     oom_score.protect()  # the slave, which cannot do it either then, logs why

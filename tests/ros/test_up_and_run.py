@@ -117,7 +117,7 @@ def test_nothing_is_left_after_a_kill(terminal, tmp_path) -> None:
 
 
 def _is_slave(process: psutil.Process) -> bool:
-    return "rosrm.slave" in process.cmdline()
+    return process.name() == "rosrm-slave"
 
 
 def test_a_part_that_dies_ends_the_rest(terminal, tmp_path) -> None:

@@ -12,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 import rosrm
@@ -83,6 +84,12 @@ def test_no_terminal_signal_of_the_slave_reaches_its_processes(host, slave):
     assert len(sessions) == 3
     stat = procfs.read_stat(supervisor)
     assert stat.parent != slave.pid
+
+
+def test_ps_names_the_supervisor_and_its_processes_as_their_programs(host, client):
+    (supervisor,) = host.pids
+    assert psutil.Process(supervisor).name() == "rosrm-superviso"  # the kernel keeps 15 bytes
+    assert psutil.Process(host.sleeper(client, "one")).name() == "sleep"
 
 
 def test_a_second_live_slave_is_refused(host, slave):

@@ -36,6 +36,7 @@ NO_STATE = {
     "rosrm/component/link.py": "the title of a process",
     "rosrm/runtime/durable.py": "for the modules of the table",
     "rosrm/runtime/private_files.py": "for the modules of the table",
+    "rosrm/runtime/process_title.py": "a file of the kernel",
     "rosrm/runtime/state_lock.py": "a lock, which the kernel holds",
     "rosrm/runtime/timer_slack.py": "a file of the kernel",
     "rosrm/slave/state_disk.py": "a file without a name, to try the disk",
