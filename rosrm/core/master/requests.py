@@ -31,7 +31,7 @@ from rosrm.core.master.rescheduling import allow_every_host
 from rosrm.core.master.rights import check_rights
 from rosrm.core.master.schedules import await_first_run, queue_again
 from rosrm.core.master.scheduling.feasibility import unknown_resources
-from rosrm.core.master.start_order import start_order_fault
+from rosrm.core.master.start_order import dependants_fault, start_order_fault
 from rosrm.core.master.state.hosts import Host
 from rosrm.core.master.state.process import WAITING, DesiredState, Process, ProcessPhase
 from rosrm.core.master.stores import check_number, check_store, make_room
@@ -72,6 +72,7 @@ def submission_received(state: MasterState, event: happened.SubmissionReceived, 
         submission_fault(state, filled)
         or neighbour_fault(state, specs, event.by.name)
         or start_order_fault(state, specs)
+        or dependants_fault(state, specs, event.by.name)
     )
     if fault:
         raise RequestRefused(f"{fault}. Nothing was queued")
@@ -347,6 +348,9 @@ def restart_requested(state: MasterState, event: happened.RestartRequested, now:
         raise RequestRefused(f"{fault}. Nothing was restarted")
     for owner in dict.fromkeys(one.principal for one in ended):
         own = [one for one in ended if one.principal == owner]
+        fault = neighbour_fault(state, [one.spec for one in own], owner)
+        if fault:
+            raise RequestRefused(f"{fault}. Nothing was restarted")
         check_gangs(state, [one.spec for one in own], owner, starting, may_join=True)
         check_number(state, len(own), owner, is_operator=own[0].by_operator)
     check_quota(state, (one.spec for one in ended if one.principal == event.by.name), event.by)

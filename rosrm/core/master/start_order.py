@@ -17,19 +17,24 @@ nor in a migration. Nothing is journaled but specs, phases, desired states and `
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from typing import Final
 
 from rosrm.core.master import lifecycle, restarts
-from rosrm.core.master.dependants import awaited_ends, circle_from, waits_for_ends
+from rosrm.core.master.dependants import (
+    awaited_ends,
+    circle_from,
+    pending_specs,
+    waits_for_ends,
+)
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.extensions.declared_fields import UnknownCapabilities
 from rosrm.model.dependencies import circle_in, condition_fault
 from rosrm.model.description_checks import other_process_fault
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.values import InstanceState, Kind, ProcessSpec, StartCondition
+from rosrm.model.values import InstanceState, Kind, ProcessSpec, StartCondition, StartOrder
 from rosrm.wording import listed, no_such, standing
 
 #: Seconds beyond the time-out of the stop of a dependant, after which its end is not awaited.
@@ -111,18 +116,24 @@ def _awaited_capabilities(state: MasterState, process: Process, now: float) -> s
 
 def _awaited(state: MasterState, process: Process, now: float) -> str:
     """Return a predicate on what a process awaits before it may start; "": nothing."""
-    order = process.spec.start_order
+    reason, start = awaited_by(state, process.spec.start_order, now)
+    state.start_orders.set_delay(process.name, start if start > now else inf)
+    return reason
+
+
+def awaited_by(state: MasterState, order: StartOrder, now: float) -> tuple[str, float]:
+    """Return a predicate on what a start awaits ("": nothing), and its earliest time, or inf."""
     held_since = {name: _holds_since(state, name, what) for name, what in order.after.items()}
     start = max(held_since.values(), default=-inf) + order.delay
-    state.start_orders.set_delay(process.name, start if start > now else inf)
     if start <= now:
-        return ""
+        return "", start
     if start < inf:
-        return f"waits for the end of its delay of {order.delay:g} s after {listed(order.after)}"
+        why = f"waits for the end of its delay of {order.delay:g} s after {listed(order.after)}"
+        return why, start
     missing = [name for name, since in held_since.items() if since == inf]
     conditions = listed(f"for {name} {_TO_BE[order.after[name]]}" for name in missing)
     obstacles = [_obstacle(state, name, order.after[name]) for name in missing]
-    return "; ".join([f"waits {conditions}", *filter(None, obstacles)])
+    return "; ".join([f"waits {conditions}", *filter(None, obstacles)]), inf
 
 
 def _holds_since(state: MasterState, name: str, condition: StartCondition) -> float:
@@ -235,14 +246,49 @@ def start_order_fault(state: MasterState, starting: Sequence[ProcessSpec]) -> st
     return circle_from(state, starting)
 
 
+def dependants_fault(state: MasterState, coming: Iterable[ProcessSpec], owner: str) -> str:
+    """Return why a process that does not change could never start after a changed one; "": none.
+
+    Args:
+        state: has the dependants. Those of other users hold back no change.
+        coming: specs that come into force together.
+        owner: owner of those among them that do not live.
+    """
+    known, pending = {spec.name: spec for spec in coming}, pending_specs(state)
+    later: dict[str, list[str]] = {}
+    for spec in pending.values():
+        for name in spec.start_order.after:
+            later.setdefault(name, []).append(spec.name)
+    for name, spec in known.items():
+        fault = condition_fault(spec, "finished")
+        others = {*state.start_orders.dependants.get(name, ()), *later.get(name, ())}
+        for other in sorted(others - known.keys()) if fault else ():
+            order = (pending.get(other) or state.processes[other].spec).start_order
+            if order.after.get(name) == "finished" and _binds(state, other, name, owner):
+                return (
+                    f"{other} starts once {name} has finished, but {fault}. Otherwise cancel "
+                    f"{other}, or change its `after`, first"
+                )
+    return ""
+
+
+def _binds(state: MasterState, dependant: str, name: str, owner: str) -> bool:
+    """Return True if a dependant holds back changes of a process; `owner`: of one that is new."""
+    process, other = state.processes.get(dependant), state.processes.get(name)
+    if other is not None and not other.phase.is_terminal:
+        owner = other.principal
+    return process is None or process.by_operator or process.principal == owner
+
+
 def _dependency_fault(
     state: MasterState, starting: Mapping[str, ProcessSpec], name: str, condition: StartCondition
 ) -> str:
     """Return why no process can start after this one; "": it can."""
-    process = state.processes.get(name)
-    if process is None and name not in starting:
+    process, spec = state.processes.get(name), starting.get(name)
+    if spec is None and process is not None:
+        spec = pending_specs(state).get(name) or state.spec_to_be(process)
+    if spec is None:
         return no_such("process", [name], [*starting, *reversed(state.processes)])
-    spec = starting[name] if process is None or name in starting else process.spec
     fault = condition_fault(spec, condition)
     if fault:
         return fault

@@ -79,6 +79,22 @@ def test_a_version_whose_gang_could_never_start_does_not_return() -> None:
     assert cluster.recorded("application_returns") == []
 
 
+def test_a_version_whose_gang_waits_for_a_failed_process_does_not_return() -> None:
+    """None of the gang could start, and those that run now would be stopped for it."""
+    cluster = Cluster("h").with_processes(process("c"))
+    cluster.apply("one", member("a"), member("b", "c"))
+    cluster.wait(3.0)
+    new = member("a", together="", command=("new",))
+    assert cluster.apply("one", new, process("x"), healthy_for=30.0).accepted
+    cluster.wait(3.0)
+    cluster.finish("c", "h", code=1)
+    cluster.finish("x", "h", code=1)
+    cluster.wait(3.0)
+    (said,) = cluster.recorded("application_failed")
+    assert "the former version 1 does not return: b: after: c has failed: `rosrm re" in said
+    assert cluster.phase("a") == "running"
+
+
 def test_a_process_that_the_former_version_lacks_does_not_prevent_the_return() -> None:
     """In the failed version d waits, through x, for a process outside its gang."""
     cluster = Cluster("h")

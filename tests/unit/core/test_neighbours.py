@@ -190,6 +190,25 @@ def test_a_preferred_spread_is_even() -> None:
 
 # --- contradictions ---------------------------------------------------------------------------
 
+
+def test_a_process_does_not_start_again_by_a_rule_that_can_no_longer_be_kept() -> None:
+    """Its neighbour has changed since it ended, or since its version was replaced."""
+    cluster = Cluster("a").with_processes(process("q"), process("p", neighbours=near("q")))
+    cluster.apply("app", process("r", neighbours=near("q")))
+    cluster.wait(3.0)
+    cluster.apply("app", process("r", command=("new",)), process("x"), healthy_for=30.0)
+    cluster.cancel("p", "q")
+    cluster.wait(3.0)
+    rules = (*apart("p"), *apart("r"))
+    assert cluster.submit(process("q", neighbours=rules)).accepted
+    says = "must run apart, and near each other: no hosts can keep both rules"
+    assert says in cluster.restart("p").message
+    cluster.finish("x", code=1)
+    cluster.wait(3.0)
+    (said,) = cluster.recorded("application_failed")
+    assert f"does not return: q and r {says}" in said or f"does not return: r and q {says}" in said
+
+
 CONTRADICTIONS = {
     "itself": ([process("p", neighbours=near("p"))], "p: it must run near itself"),
     "apart from itself": (

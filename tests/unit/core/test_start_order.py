@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from rosrm.core.master import events as happened
 from rosrm.model.arrays import ArrayMembership
 from rosrm.model.orders import RestartInstance, StopInstance
+from rosrm.model.requester import Requester
 from rosrm.model.schedules import Schedule
 from rosrm.model.values import (
     HostLossPolicy,
@@ -302,14 +305,95 @@ def test_a_start_order_that_cannot_be_kept_is_refused(specs: list[ProcessSpec], 
     assert set(cluster.state.processes) == set(names)
 
 
-def test_a_wait_for_the_end_of_a_job_that_got_a_schedule_names_the_schedule() -> None:
-    """The dependency was accepted without one."""
+NEVER_FINISHES = {
+    "a schedule": (job("batch", schedule=HOURLY), "batch has a schedule, so it never finishes"),
+    "a service": (process("batch"), "batch is a service, which does not finish"),
+}
+B_WAITS = process("b", start_order=after(batch="finished"))
+
+
+@pytest.mark.parametrize(("changed", "why"), NEVER_FINISHES.values(), ids=NEVER_FINISHES)
+@pytest.mark.parametrize("how", ["submitted", "applied", "pending"])
+def test_a_job_whose_end_a_process_awaits_remains_one_that_ends(
+    changed: ProcessSpec, why: str, how: str
+) -> None:
+    """Its change is refused, until the process that waits has another order or is cancelled."""
     cluster = Cluster("a")
+    cluster.apply("work", job("batch")) if how != "submitted" else cluster.submit(job("batch"))
+    if how == "pending":  # the change is accepted first, and its stop takes long
+        cluster.machines["a"].stubborn.add("batch")
+        cluster.apply("work", changed)
+        assert why in cluster.submit(B_WAITS).message
+        return
+    cluster.submit(B_WAITS)
+    if how == "submitted":
+        cluster.cancel("batch")
+    change = (
+        (lambda: cluster.submit(changed))
+        if how == "submitted"
+        else (lambda: cluster.apply("work", changed))
+    )
+    reply = change()
+    assert not reply.accepted
+    assert f"b starts once batch has finished, but {why}" in reply.message
+    cluster.cancel("b")
+    assert change().accepted
+
+
+def test_both_sides_of_a_wait_can_be_changed_in_one_request() -> None:
+    """Or one after the other, the process that waits first, or the job first that gets an end."""
+    cluster, ready = Cluster("a"), process("b", start_order=after("batch"))
+    cluster.apply("work", job("batch"), B_WAITS)
+    assert cluster.apply("work", job("batch", schedule=HOURLY), ready).accepted
+    cluster.wait(2.0)
+    assert cluster.phase("b") == "running"
+    cluster = Cluster("a").with_processes()
+    cluster.apply("one", job("batch"))
+    cluster.apply("two", B_WAITS)
+    assert cluster.apply("two", ready).accepted
+    assert cluster.apply("one", job("batch", schedule=HOURLY)).accepted
+    assert cluster.apply("one", job("batch")).accepted
+    assert cluster.apply("two", B_WAITS).accepted
+
+
+def test_a_wait_for_the_end_of_the_job_of_another_user_holds_back_no_change() -> None:
+    """The reason of the process that waits names the change."""
+    cluster, user = Cluster("a"), Requester("user:ada")
     cluster.apply("work", job("batch"))
-    cluster.submit(process("b", start_order=after(batch="finished")))
-    cluster.apply("work", job("batch", schedule=HOURLY))
+    cluster.ask(happened.SubmissionReceived, (B_WAITS,), user)
+    assert cluster.apply("work", job("batch", schedule=HOURLY)).accepted
     cluster.wait(5.0)
     assert "waits for batch to finish; batch has a schedule, so it" in cluster["b"].reason
+
+
+def test_a_running_process_is_not_stopped_for_a_version_that_waits_for_another_process() -> None:
+    """A process of another application has failed since the request, or a new job has to finish."""
+    cluster = Cluster("a")
+    cluster.apply("work", process("b"))
+    cluster.wait(3.0)
+    changed = replace(B_WAITS, command=("new",))
+    assert cluster.apply("work", changed, job("batch")).accepted
+    cluster.wait(3.0)
+    assert (cluster.phase("b"), cluster["b"].spec.command) == ("running", process("b").command)
+    (task,) = cluster.state.applications["work"].tasks.values()
+    assert task.reason == "its new version waits for batch to finish"
+    cluster.finish("batch")
+    cluster.wait(3.0)
+    assert (cluster.phase("b"), cluster["b"].spec.command) == ("running", ("new",))
+
+
+def test_a_version_in_which_an_awaited_job_never_ends_does_not_return() -> None:
+    """A process waits since for the end that it has in the version that fails."""
+    cluster = Cluster("a")
+    cluster.apply("work", job("batch", schedule=HOURLY))
+    cluster.wait(2.0)
+    cluster.apply("work", job("batch"), process("x"), healthy_for=30.0)
+    cluster.wait(2.0)
+    assert cluster.submit(B_WAITS).accepted
+    cluster.finish("x", code=1)
+    cluster.wait(2.0)
+    (said,) = cluster.recorded("application_failed")
+    assert "does not return: b starts once batch has finished, but batch has a schedule" in said
 
 
 def test_a_circle_through_processes_that_run_is_refused() -> None:

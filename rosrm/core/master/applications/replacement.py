@@ -24,6 +24,7 @@ from rosrm.core.master.migration.start import (
 from rosrm.core.master.outcomes import Rejected
 from rosrm.core.master.scheduling.decision import decide
 from rosrm.core.master.scheduling.feasibility import why_never
+from rosrm.core.master.start_order import awaited_by
 from rosrm.core.master.state.demand import Demand
 from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
 from rosrm.extensions.declared_fields import UnknownCapabilities
@@ -60,14 +61,12 @@ def try_replace(
     if never:
         return NeverFits(f"no host may take its new version: {never}")
     if process.phase is not ProcessPhase.RUNNING or not can_move:
-        _stop_and_start(state, process, spec, cause, now)
-        return None
+        return _stop_and_start(state, process, spec, cause, now)
     if not may_begin(state, 1):
         return Busy("waits until another process has moved")
     refusal = _migrate(state, process, spec, cause, now)
     if refusal is not None and kept == "none":
-        _stop_and_start(state, process, spec, cause, now)
-        return None
+        return _stop_and_start(state, process, spec, cause, now)
     return refusal
 
 
@@ -109,8 +108,14 @@ def _demand(
 
 def _stop_and_start(
     state: MasterState, process: Process, spec: ProcessSpec, cause: str, now: float
-) -> None:
-    """Stop a process; its start from the queue has the new spec."""
+) -> Busy | None:
+    """Stop a process; its start from the queue has the new spec.
+
+    One that runs keeps running while the new version would wait for other processes.
+    """
+    awaits, _ = awaited_by(state, spec.start_order, now)
+    if awaits and process.phase is ProcessPhase.RUNNING:
+        return Busy(f"its new version {awaits}")
     process.next_spec, process.wanted = spec, DesiredState.REQUEUE
     state.record(
         now, EventKind.REPLACED, f"{process.name} is stopped, and starts again: {cause}",
@@ -120,3 +125,4 @@ def _stop_and_start(
         if not instance.stopping:
             lifecycle.stop_instance(state, instance, now)
     state.save(process)
+    return None

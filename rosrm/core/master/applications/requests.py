@@ -22,7 +22,7 @@ from rosrm.core.master.process_defaults import with_defaults
 from rosrm.core.master.quotas import check_quota
 from rosrm.core.master.requests import count, submission_fault
 from rosrm.core.master.rights import check_rights
-from rosrm.core.master.start_order import start_order_fault
+from rosrm.core.master.start_order import dependants_fault, start_order_fault
 from rosrm.core.master.state.applications import Application, Version
 from rosrm.core.master.state.process import WAITING, DesiredState, Process
 from rosrm.core.master.stores import check_store, make_room
@@ -239,7 +239,7 @@ def _check_specs(state: MasterState, prepared: Iterable[Prepared], by: Requester
     desired = [
         spec for one in prepared if one.version is not None for spec in one.version.specs.values()
     ]  # fmt: skip
-    fault = fault or _start_order_fault(state, prepared, desired)
+    fault = fault or _start_order_fault(state, prepared, desired, by)
     if fault:
         raise RequestRefused(f"{fault}. Nothing was changed")
     action = {name: found.action for one in prepared for name, found in one.found.items()}
@@ -269,15 +269,16 @@ def _owners(prepared: Iterable[Prepared]) -> list[Requester]:
 
 
 def _start_order_fault(
-    state: MasterState, prepared: Iterable[Prepared], desired: Sequence[ProcessSpec]
-) -> str:
-    """Return why a desired process could never start; "": each one may."""
+    state: MasterState, prepared: Iterable[Prepared], desired: Sequence[ProcessSpec],
+    by: Requester,
+) -> str:  # fmt: skip
+    """Return why a desired process or one after it could never start; "": each one may."""
     found = [item for one in prepared for item in one.found.items()]
     stopped = {name for name, difference in found if difference.action is Action.STOP}
     for spec in desired:
         for name in stopped.intersection(spec.start_order.after):
             return f"{spec.name}: after: {name} is no longer a process of its application"
-    return start_order_fault(state, desired)
+    return start_order_fault(state, desired) or dependants_fault(state, desired, by.name)
 
 
 # --- changes ----------------------------------------------------------------------------------

@@ -40,10 +40,12 @@ from rosrm.core.master.applications.replacement import Busy, NeverFits, try_repl
 from rosrm.core.master.assignment.assign import reconsider_set_aside
 from rosrm.core.master.assignment.gangs import gang_fault
 from rosrm.core.master.cancellation import cancel
+from rosrm.core.master.contradictions import neighbour_fault
 from rosrm.core.master.dependants import circle_from, dependants_first
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.requests import add_process, still_stopping
 from rosrm.core.master.schedules import change_between_runs
+from rosrm.core.master.start_order import dependants_fault, start_order_fault
 from rosrm.core.master.state.applications import Application, Task
 from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.process import (
@@ -349,17 +351,24 @@ def _fault_of_return(
     given = former.specs.values() if former is not None else ()
     specs = {spec.name: spec for spec in given if spec.name not in stay_cancelled}
     found = differences(state, application.name, specs, ())
+    waiting = {
+        name for name, spec in specs.items()
+        if (name in found and found[name].action is Action.START)
+        or (name in state.processes and state.processes[name].phase in WAITING)
+    }  # fmt: skip
+    starting = waiting | {name for name in found if found[name].action is Action.REPLACE}
     joining = {
-        name: (application.principal, spec.together)
-        for name, spec in specs.items()
-        if spec.together
-        and (
-            (name in found and found[name].action is Action.START)
-            or (name in state.processes and state.processes[name].phase in WAITING)
-        )
-    }
+        name: (application.principal, specs[name].together)
+        for name in waiting if specs[name].together
+    }  # fmt: skip
     coming, leaving = list(specs.values()), application.specs.keys() - specs.keys()
-    return circle_from(state, coming) or gang_fault(state, coming, joining, leaving)
+    return (
+        neighbour_fault(state, coming, application.principal)
+        or start_order_fault(state, [specs[name] for name in specs if name in starting])
+        or circle_from(state, coming)
+        or dependants_fault(state, coming, application.principal)
+        or gang_fault(state, coming, joining, leaving)
+    )
 
 
 def _is_cancelled(state: MasterState, name: str) -> bool:
