@@ -63,6 +63,7 @@ from rosrm.ros.slave.journal_watermark import JournalWatermark
 from rosrm.ros.slave.lifecycle_nodes import LifecycleClients
 from rosrm.ros.slave.replication import ReplicationEndpoint
 from rosrm.ros.slave.services import Duties, ExecutorOutcome, LogQuery, SlaveServices
+from rosrm.runtime import durable
 from rosrm.runtime.bootstrap import end_start, handle_signals
 from rosrm.runtime.path_calls import PathCalls, at
 from rosrm.runtime.settings_check import Checked, SettingsCheck, SettingsSource
@@ -281,10 +282,10 @@ class SlaveRuntime:
     def _serve_master(self, max_age: float) -> None:
         """Offer the services of this slave, with those of snapshot replication."""
         config = self._config
-        self._disks = [DiskWatch(self._paths.run, config.state, "state directory", self._note_disk)]
+        self._disks = [DiskWatch(self._paths.run, config.state, "state directory", self._note_part)]
         self._logs = Path(log_folder(str(self._supervisor.state))).resolve()  # it may be a link
         if self._logs.stat().st_dev != config.state.stat().st_dev:
-            other = DiskWatch(self._paths.run, self._logs, "log directory", self._note_disk)
+            other = DiskWatch(self._paths.run, self._logs, "log directory", self._note_part)
             self._disks.append(other)
         self._epoch_note = EpochNote(config.state / EPOCH_NOTE, self._paths.run)
         self._replication = ReplicationService(
@@ -390,6 +391,7 @@ class SlaveRuntime:
     def _is_registered(self) -> bool:
         return self._endpoint.link is MasterLink.REGISTERED
 
+    @durable.lease_kept_here()
     def _serve(self, condition: Callable[[], bool]) -> None:
         end_start()
         self._process.keep_own()
@@ -544,12 +546,6 @@ class SlaveRuntime:
                     failing["probe", resource] = f"probe {report.probe}: {report.reason}"
                 else:
                     failing.pop(("probe", resource), None)
-
-    def _note_disk(self, part: str, fault: str) -> None:
-        """Report whether a directory takes data."""
-        self._note_part(part, fault)
-        if not fault:
-            self._starter.write_missing_keys()
 
     def _note_part(self, part: str, fault: str) -> None:
         """Log that a part of the host begins or ceases to fail, and report that to the master."""

@@ -132,6 +132,11 @@ class SupervisorLink:
         return self._client.reads_secrets
 
     @property
+    def writes_files(self) -> bool:
+        """Return True if the supervisor writes the files of instances."""
+        return self._client.writes_files
+
+    @property
     def adopts(self) -> bool:
         """Return True if the supervisor can adopt processes."""
         return self._client.adopts

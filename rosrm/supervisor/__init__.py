@@ -12,6 +12,7 @@
     exec_failures.py      reasons for programs that cannot be executed
     adoption.py           checks before a process that was started without rosrm is taken over
     secret_files.py       secrets, read just before a spawn
+    instance_files.py     parameters and key of an instance, written just before a spawn
     confinement.py        start of an instance within its limits
     group_trees.py        where control groups may be made
     instance_groups.py    the control groups of the instances

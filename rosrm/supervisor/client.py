@@ -92,6 +92,7 @@ class SupervisorClient:
         adopts: it can adopt processes; one of an earlier version cannot.
         holds_starts: it holds a start until a slot is free; one of an earlier version starts at
             once.
+        writes_files: it writes the files of instances; one of an earlier version does not.
         notes: faults that the supervisor found in its record, as text for the user.
         pid: of the supervisor.
     """
@@ -116,6 +117,7 @@ class SupervisorClient:
         self.unenforced: Mapping[str, str] = {}
         self.groups: tuple[tuple[int, str, tuple[str, ...]], ...] = ()
         self.reads_secrets = self.amends_limits = self.adopts = self.holds_starts = False
+        self.writes_files = False
         self.notes: tuple[str, ...] = ()
         self.pid = 0
 
@@ -228,7 +230,7 @@ class SupervisorClient:
             key_of(order.instance), order.argv, self._base_id, changes, order.working_directory,
             restart_rule(order.restart), stop_rule(order.stop), order.memo,
             fence_rule(order.fence), order.last_contact, order.limits, order.secrets,
-            order.adoption, order.slots, order.files,
+            order.adoption, order.slots, order.files, order.contents,
         )  # fmt: skip
 
     def _choose_base(self, environment: Mapping[str, str]) -> None:
@@ -321,6 +323,7 @@ class SupervisorClient:
         self.amends_limits = bool(fields.get("amends", False))
         self.adopts = bool(fields.get("adopts", False))
         self.holds_starts = bool(fields.get("holds", False))
+        self.writes_files = bool(fields.get("contents", False))
         groups: Any = fields.get("groups", ())
         self.groups = tuple((version, top, tuple(names)) for version, top, names in groups)
         self.memos = {InstanceId(*messages.read_key(key)): str(memo) for key, memo in memos}

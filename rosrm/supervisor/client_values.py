@@ -47,6 +47,8 @@ class LaunchOrder:
         slots: start once fewer than this number of other instances are active, that is, neither
             held nor ended; 0: start at once.
         files: words of `argv` that should name files in the working directory.
+        contents: path to the content of a file that the instance reads. The supervisor records the
+            content, and writes the file before each start.
     """
 
     instance: InstanceId
@@ -63,6 +65,7 @@ class LaunchOrder:
     adoption: AdoptionRule | None = None
     slots: int = 0
     files: tuple[str, ...] = ()
+    contents: Mapping[str, str] = field(default_factory=lambda: EMPTY, repr=False)
 
 
 @dataclass(frozen=True, slots=True)

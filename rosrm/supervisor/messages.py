@@ -11,7 +11,7 @@ The client sends orders; the key `do` names the order:
     start        instance, argv, environment, changes, directory, restart, stop, fence,
                  heard, memo, limits,
                  secrets, adoption, slots,
-                 files
+                 files, contents
                                                 environment: id of a base; changes: variable to
                                                 value, or null to leave it out; restart and stop:
                                                 the fields of the policies, in their order
@@ -27,6 +27,8 @@ The client sends orders; the key `do` names the order:
                                                 are neither held nor ended; 0: start at once
                                                 files: words of argv that should name files in
                                                 the directory
+                                                contents: path to the content of a file that the
+                                                instance reads, which is written before each start
     stop         instance                       SIGINT, SIGTERM, SIGKILL; for an unknown instance:
                                                 refuse a `start` that arrives later
     fence        instance                       SIGKILL to the process tree; for an unknown
@@ -52,7 +54,7 @@ The client sends orders; the key `do` names the order:
 The supervisor sends messages; the key `tell` names the message:
 
     welcome      protocol, pid, notes, instances, memos, fenced, unenforced, groups, secrets,
-                 amends, adopts, holds
+                 amends, adopts, holds, contents
                                                    the answer to hello; instances: their statuses;
                                                    memos: [instance, text] of those that have one
                                                    fenced: those that have a fence
@@ -64,6 +66,7 @@ The supervisor sends messages; the key `tell` names the message:
                                                    amends: true: it can change limits
                                                    adopts: true: it can adopt processes
                                                    holds: true: it can hold a start (`slots`)
+                                                   contents: true: it writes the files of instances
     status       status                            a change, or the answer to a repeated order; not
                                                    "starting" if the spawn follows at once
     amended      instance, restart, limits,        the amendment is recorded; its status came before
@@ -144,6 +147,7 @@ class Launch(NamedTuple):
     adoption: AdoptionRule | None = None
     slots: int = 0
     files: tuple[str, ...] = ()
+    contents: Mapping[str, str] = MappingProxyType({})
 
     def amended(self, amendment: Amend) -> Launch:
         """Return this launch as it is after an amendment."""
@@ -254,8 +258,8 @@ _KINDS: Final[Mapping[type, str]] = {
 
 def launch_fields(launch: Launch) -> dict[str, Any]:
     """Return a launch in values that JSON can hold; the record stores the same form."""
-    mappings = {"changes": dict(launch.changes), "secrets": dict(launch.secrets)}
-    return {**launch._asdict(), **mappings}
+    mappings = ("changes", "secrets", "contents")
+    return {**launch._asdict(), **{name: dict(getattr(launch, name)) for name in mappings}}
 
 
 def decode_order(text: bytes) -> Order:
@@ -295,6 +299,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         _adoption(fields.get("adoption")),
         read_whole(fields.get("slots", 0), 0),  # not sent by clients of an earlier version
         tuple(read_text(word) for word in fields.get("files", ())),  # nor these
+        read_texts(fields.get("contents", {})),  # likewise: they write the files
     )
 
 
@@ -474,7 +479,8 @@ def encode_welcome(
     welcome = {"tell": "welcome", "protocol": PROTOCOL, "pid": pid, "notes": list(notes)}
     known = {"instances": statuses, "memos": list(memos.items()), "fenced": fenced}
     return line({**welcome, **known, "unenforced": dict(unenforced), "groups": groups,
-                 "secrets": True, "amends": True, "adopts": True, "holds": True})  # fmt: skip
+                 "secrets": True, "amends": True, "adopts": True, "holds": True,
+                 "contents": True})  # fmt: skip
 
 
 def encode_status(status: Status) -> bytes:

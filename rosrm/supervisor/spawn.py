@@ -1,9 +1,10 @@
 """Start of one process: a session leader with its output in a file, inheriting nothing else.
 
 The forked child does all that touches a path of the user: it reads the files of secrets, enters the
-working directory, searches the PATH, and executes the program. On a file system that does not
-answer, each of these stops the caller, even against SIGKILL. The parent only reads the report of
-the child, which names the step that the child is at. A successful exec closes the report.
+working directory, searches the PATH, and executes the program. It also writes the files of its
+instance. On a file system that does not answer, each of these stops the caller, even against
+SIGKILL. The parent only reads the report of the child, which names the step that the child is at. A
+successful exec closes the report.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from rosrm.shortage import SHORTAGE
 from rosrm.supervisor import (  # a child may be unable to load them
     descriptors,
     exec_failures,
+    instance_files,
     secret_files,
 )
 from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError, is_transient
@@ -54,6 +56,7 @@ class Program(NamedTuple):
         nice: niceness; 0: that of this process. Without the right to it, that of this process.
         files: soft limit of open descriptors; None: that of this process.
         named: words of `argv` that should name files in the directory.
+        contents: path to the content of a file of its instance.
     """
 
     argv: tuple[str, ...]
@@ -63,6 +66,7 @@ class Program(NamedTuple):
     nice: int = 0
     files: int | None = None
     named: tuple[str, ...] = ()
+    contents: Mapping[str, str] = {}
 
 
 class Attempt:
@@ -239,6 +243,9 @@ def _execute(
     program: Program, tell: Callable[[str, str], None], scheduler: Scheduler | None, parent: int
 ) -> NoReturn:
     environment, directory = dict(program.environment), program.directory
+    for path, content in program.contents.items():
+        tell(_STEP, f"the file {path!r}")
+        instance_files.provide(path, content)
     tell(_STEP, f"the working directory {directory!r}")
     _enter(directory)
     for word in program.named:

@@ -1,6 +1,6 @@
 """Conversion of an assignment into an order for the supervisor.
 
-The order consists of command line, environment and parameters.
+The order consists of command line, environment, and the files that the instance reads.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import base64
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from rosrm.core.supervisor.rules import AdoptionRule
 from rosrm.errors import LaunchError
@@ -44,46 +44,64 @@ _RUN_PACKAGE: Final = (
 _SHORT: Final = _LONGEST // 16
 
 
+class PlainLaunch(NamedTuple):
+    """A launch before a launcher changes it.
+
+    Attributes:
+        contents: as in `LaunchOrder`.
+    """
+
+    launch: Launch
+    contents: Mapping[str, str]
+
+
 def plain_launch(
     assignment: Assignment, base_environment: Mapping[str, str], python: str, *,
     where: ProcessLocation, state_directory: Path, launchers: Launchers,
-) -> Launch:  # fmt: skip
-    """Return the launch of an assignment without a launcher, and write its parameters to a file.
+) -> PlainLaunch:  # fmt: skip
+    """Return the launch of an assignment without a launcher, with its parameters and its key.
 
     Args:
         base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
         where: host and cluster of the instance.
-        state_directory: of this host's supervisor; the parameters are beside the instance's log.
+        state_directory: of this host's supervisor; the files are beside the instance's log, with
+            which they are pruned.
 
     Raises:
         LaunchError: the program was not found, with the searched places; or another error of the
             spec on this host.
     """
     assignment = with_artifacts(with_devices(assignment, where.devices), where.artifacts)
-    spec = assignment.spec
-    environment = process_environment(assignment, base_environment, where, launchers.variables)
+    spec, files = assignment.spec, {}
+    key, key_file = where.instance_key(assignment.instance), ""
+    if key is not None:
+        key_file = str(key_path(state_directory, assignment.instance))
+        files[key_file] = base64.b64encode(key).decode()
+    made = (base_environment, where, launchers.variables, key_file)
+    environment = process_environment(assignment, *made)
     filled = with_packages(spec, ament_index.search_path(environment, python))
     if filled is not spec:
         spec, assignment = filled, replace(assignment, spec=filled)
-        environment = process_environment(assignment, base_environment, where, launchers.variables)
+        environment = process_environment(assignment, *made)
     try:
         command = (*spec.prefix, *_command(spec, environment, python))
-        arguments = _arguments(assignment, state_directory)
+        arguments = _arguments(assignment, state_directory, files)
     except (OSError, ValueError) as error:  # a folder of another user, a text without encoding
         raise LaunchError(f"{assignment.instance}: {error}") from None
-    return Launch(assignment, where.cluster, (*command, *arguments), environment)
+    launch = Launch(assignment, where.cluster, (*command, *arguments), environment)
+    return PlainLaunch(launch, files)
 
 
-def order_of(plain: Launch, launchers: Launchers, host: str) -> LaunchOrder:
+def order_of(plain: PlainLaunch, launchers: Launchers, host: str) -> LaunchOrder:
     """Return the supervisor's order for a launch, as the launcher of its process changes it.
 
     Raises:
         LaunchError: the launcher fails, or this host cannot start the process.
     """
-    launch, assignment = launchers.prepare(plain), plain.assignment
+    launch, assignment = launchers.prepare(plain.launch), plain.launch.assignment
     spec = assignment.spec
-    _check_length(launch)
+    _check_length(launch, plain.contents)
     return LaunchOrder(
         instance=assignment.instance,
         argv=launch.argv,
@@ -98,6 +116,7 @@ def order_of(plain: Launch, launchers: Launchers, host: str) -> LaunchOrder:
         secrets=spec.secrets,
         adoption=_adoption(spec.adoption, host),
         files=relative_files(spec),
+        contents=plain.contents,
     )
 
 
@@ -112,16 +131,17 @@ def _adoption(adoption: Adoption, host: str) -> AdoptionRule | None:
     return AdoptionRule(adoption.pid, adoption.birth, adoption.boot)
 
 
-def _check_length(launch: Launch) -> None:
+def _check_length(launch: Launch, files: Mapping[str, str]) -> None:
     """Raise `LaunchError` if the supervisor would refuse the order, which is one line for it."""
-    parts = (*launch.argv, *launch.environment, *launch.environment.values())
+    texts = (*launch.environment, *launch.environment.values(), *files.values())
+    parts = (*launch.argv, *texts)
     if sum(map(len, parts)) + len(parts) < _SHORT:
         return
     length = len(json_lines.line({"parts": parts}))
     if length > _LONGEST:
         raise LaunchError(
-            f"{launch.assignment.instance}: command line and environment have {length} bytes; "
-            f"allowed: {_LONGEST}. Pass long texts in a file"
+            f"{launch.assignment.instance}: command line, environment and parameters have {length} "
+            f"bytes; allowed: {_LONGEST}. Pass long texts in a file"
         )
 
 
@@ -168,25 +188,21 @@ def command_in_image(spec: ProcessSpec) -> tuple[str, ...]:
     return spec.command
 
 
-def write_key(instance: InstanceId, key: bytes, state_directory: Path) -> bool:
-    """Write the key of an instance beside its log, with which it is pruned.
+def write_files(files: Mapping[str, str]) -> None:
+    """Write the files of an instance, for a supervisor of an earlier version, which does not.
 
-    Return False if the disk takes no data now. That refuses no start, as it may be over at once,
-    and the supervisor knows which start is tried again.
+    Such a supervisor does not compare them after a loss of power either.
 
     Raises:
-        LaunchError: it cannot be written.
+        LaunchError: a file cannot be written.
     """
-    path = key_path(state_directory, instance)
-    at(path)
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        durable.replace_durably(str(path), base64.b64encode(key))
-    except OSError as error:
-        if error.errno in durable.NO_ROOM:
-            return False
-        raise LaunchError(f"the key of {instance} cannot be written: {reason_of(error)}") from None
-    return True
+    for path, content in files.items():
+        at(path)
+        try:
+            Path(path).parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            durable.replace_durably(path, content.encode())
+        except OSError as error:
+            raise LaunchError(f"{path} cannot be written: {reason_of(error)}") from None
 
 
 def key_path(state_directory: Path, instance: InstanceId) -> Path:
@@ -194,29 +210,17 @@ def key_path(state_directory: Path, instance: InstanceId) -> Path:
     return log_path(state_directory, instance).with_suffix(".key")
 
 
-def _arguments(assignment: Assignment, state_directory: Path) -> list[str]:
-    """Return the arguments of a command line; the parameters of a node go to a file."""
+def _arguments(assignment: Assignment, state_directory: Path, files: dict[str, str]) -> list[str]:
+    """Return the arguments of a command line; add the parameters of a node to the files."""
     spec = assignment.spec
     if not spec.ros:
         return list(spec.arguments)
-    parameters_file = _write_parameters(assignment, state_directory)
+    parameters_file = None
+    text = parameters_text(all_parameters(spec, assignment.node_name))
+    if text:
+        text.encode()  # raises ValueError here, where it refuses the instance with its name
+        log = log_path(state_directory, assignment.instance)
+        parameters_file = str(log.with_suffix(".parameters.yaml"))
+        files[parameters_file] = text
     ros = ros_arguments(spec, assignment.node_name, parameters_file)
     return join_arguments(spec.arguments, ros)
-
-
-def _write_parameters(assignment: Assignment, state_directory: Path) -> str | None:
-    """Write the parameters beside the instance's log and return their path; pruned with the log.
-
-    None: there are no parameters.
-    """
-    text = parameters_text(all_parameters(assignment.spec, assignment.node_name))
-    if not text:
-        return None
-    path = log_path(state_directory, assignment.instance).with_suffix(".parameters.yaml")
-    at(path)
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        durable.replace_durably(str(path), text.encode())
-    except OSError as error:
-        raise LaunchError(f"the parameters cannot be written: {reason_of(error)}") from None
-    return str(path)

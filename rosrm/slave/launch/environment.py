@@ -55,8 +55,6 @@ class ProcessLocation:
         keep_every: seconds by which a snapshot may be behind the state.
         epoch_file: file with the newest epoch of the master; None: there is none.
         instance_key: returns the key of an instance; None: with `security: none`.
-        key_file: writes the key of an instance into a file and returns its path, because a process
-            shows its environment to others: in logs, in reports, to its children.
         devices: devices of the host.
         artifacts: directory of the artifacts of all processes; None: there are none.
     """
@@ -68,7 +66,6 @@ class ProcessLocation:
     keep_every: float = 1.0
     epoch_file: Path | None = None
     instance_key: Callable[[InstanceId], bytes | None] = no_key
-    key_file: Callable[[InstanceId], str] | None = None
     devices: tuple[Device, ...] = ()
     artifacts: Path | None = None
 
@@ -80,13 +77,15 @@ def snapshot_directory(snapshots: Path, process: str) -> Path:
 
 def process_environment(
     assignment: Assignment, base: Mapping[str, str], where: ProcessLocation,
-    not_inherited: Sequence[str] = (),
+    not_inherited: Sequence[str] = (), key_file: str = "",
 ) -> dict[str, str]:  # fmt: skip
     """Return all variables of an instance; those of its spec take precedence, except its devices.
 
     Args:
         base: environment of the slave, with its ROS settings (ROS_DOMAIN_ID, ...).
         not_inherited: variables that launchers set, so those of the slave do not count.
+        key_file: file with the key of the instance, because a process shows its environment to
+            others: in logs, in reports, to its children; "": the instance has no key.
     """
     spec = assignment.spec
     environment = without_bootstrapper(base)
@@ -112,9 +111,8 @@ def process_environment(
         environment[KEEP] = str(snapshot_directory(where.snapshots, spec.name))
         environment[KEEP_EVERY] = f"{where.keep_every:g}"
     # Of each process, because a migratable node without a key takes messages of strangers.
-    key = where.instance_key(assignment.instance)
-    if key is not None and where.key_file is not None:
-        environment[KEY_FILE] = where.key_file(assignment.instance)
+    if key_file:
+        environment[KEY_FILE] = key_file
     environment["PYTHONUNBUFFERED"] = "1"
     environment.update((name, extended(text, of_host)) for name, text in spec.environment.items())
     if spec.artifacts and where.artifacts is not None:

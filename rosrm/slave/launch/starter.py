@@ -17,7 +17,6 @@ from rosrm.config.settings import HostConfig
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.state import HeldInstance, SlaveState
 from rosrm.errors import LaunchError, assert_never, describe_fault
-from rosrm.extensions.contracts import Launch
 from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.values import Assignment, InstanceId, InstanceState, InstanceStatus
 from rosrm.ros.names import STATE_CONFIG, Names
@@ -27,7 +26,13 @@ from rosrm.runtime.path_calls import NoAnswer, PathCalls, at
 from rosrm.runtime.ros_wheels import without_bootstrapper
 from rosrm.slave.artifacts.service import ArtifactService
 from rosrm.slave.epoch import EPOCH_NOTE
-from rosrm.slave.launch.command import key_path, order_of, plain_launch, write_key
+from rosrm.slave.launch.command import (
+    PlainLaunch,
+    key_path,
+    order_of,
+    plain_launch,
+    write_files,
+)
 from rosrm.slave.launch.environment import ProcessLocation, no_key
 from rosrm.slave.launch.lanes import Lanes
 from rosrm.slave.launch.launchers import Launchers
@@ -48,7 +53,7 @@ _log = logging.getLogger("rosrm.slave")
 
 
 #: An assignment, and its order or why there is none.
-_Made = tuple[Assignment, Launch | LaunchOrder | LaunchError]
+_Made = tuple[Assignment, PlainLaunch | LaunchOrder | LaunchError]
 
 
 class _Orders:
@@ -59,8 +64,9 @@ class _Orders:
     """
 
     def __init__(
-        self, assignments: Sequence[Assignment], order: Callable[[Assignment], Launch | LaunchOrder]
-    ) -> None:
+        self, assignments: Sequence[Assignment],
+        order: Callable[[Assignment], PlainLaunch | LaunchOrder],
+    ) -> None:  # fmt: skip
         self.current: Assignment | None = None
         self._left = deque(assignments)
         self._made: list[_Made] = []
@@ -124,7 +130,6 @@ class Starter:
     _launching: dict[InstanceId, Assignment] = field(init=False, default_factory=dict)
     _closed: bool = field(init=False, default=False)
     _warned_of: set[str] = field(init=False, default_factory=set)
-    _keyless: set[InstanceId] = field(init=False, default_factory=set)
 
     def __post_init__(self) -> None:
         own = {**os.environ, **self.config.ros.environment()}
@@ -220,7 +225,6 @@ class Starter:
     def ended(self, instance: InstanceId) -> None:
         """Stop awaiting the node of an instance."""
         self._graph_before.pop(instance, None)
-        self._keyless.discard(instance)
         key = key_path(self.supervisor.state, instance)
         self.paths.run(partial(_remove, key), _ignore, _ignore)  # otherwise removed with the log
         self.replication.ended(instance)
@@ -289,18 +293,20 @@ class Starter:
         if wanted:
             self._start(wanted, slots)
 
-    def _order(self, assignment: Assignment, where: ProcessLocation) -> Launch | LaunchOrder:
+    def _order(self, assignment: Assignment, where: ProcessLocation) -> PlainLaunch | LaunchOrder:
         """Return the order of an assignment, or its launch if a plugin has to be asked.
 
         Called in a thread. Raises `LaunchError`, or `NoAnswer`.
         """
         self._check_supervisor(assignment)
         self._check_secrets(assignment)
-        launch = plain_launch(
+        plain = plain_launch(
             assignment, self._environment, sys.executable, where=where,
             state_directory=self.supervisor.state, launchers=self.launchers,
         )  # fmt: skip
-        return launch if _lane_of(assignment) else order_of(launch, self.launchers, where.host)
+        if not self.supervisor.writes_files:
+            write_files(plain.contents)
+        return plain if _lane_of(assignment) else order_of(plain, self.launchers, where.host)
 
     def _send(self, made: Sequence[_Made], slots: int) -> None:
         """Send the orders of instances that are still wanted, after their plugins were asked."""
@@ -310,7 +316,7 @@ class Starter:
             is_due = self._launching.get(instance) is assignment and not self._closed
             if not is_due or instance not in self.state.held:
                 continue
-            if isinstance(order, Launch):
+            if isinstance(order, PlainLaunch):
                 ask = partial(order_of, order, self.launchers, self.config.host)
                 done = partial(self._ordered, assignment, slots)
                 self.lanes.run(_lane_of(assignment), ask, done)
@@ -382,27 +388,12 @@ class Starter:
         self.artifacts.leave_out(seconds)
         self.replication.leave_out(seconds)
 
-    def write_missing_keys(self) -> None:
-        """Write the keys for which the disk had no room; called while it has some."""
-        for instance in list(self._keyless):
-            work = partial(self._write_key, instance)
-            self.paths.run(work, lambda _: None, lambda fault: _log.warning("%s", fault))
-
-    def _write_key(self, instance: InstanceId) -> str:
-        """Write the key of an instance, or note that it is missing; called in a thread."""
-        key, state = self.instance_key(instance) or b"", self.supervisor.state
-        if write_key(instance, key, state):
-            self._keyless.discard(instance)
-        else:
-            self._keyless.add(instance)
-        return str(key_path(state, instance))
-
     def _location(self) -> ProcessLocation:
         config = self.config
         return ProcessLocation(
             config.host, self.endpoint.cluster, Names(config.ros.namespace)(STATE_CONFIG),
             self.snapshots, config.keep.every, config.state / EPOCH_NOTE, self.instance_key,
-            self._write_key, self.endpoint.description.devices, self.artifacts.root,
+            self.endpoint.description.devices, self.artifacts.root,
         )  # fmt: skip
 
 

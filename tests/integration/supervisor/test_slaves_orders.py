@@ -24,10 +24,8 @@ from rosrm.model.values import (
 )
 from rosrm.runtime.path_calls import PathCalls
 from rosrm.runtime.worker import Worker
-from rosrm.slave.launch.command import key_path
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.slave.launch.starter import Starter
-from tests.faults.disks import small_disk
 from tests.hung_files import hung_files
 from tests.waiting import PATIENCE
 
@@ -46,7 +44,7 @@ class Slave:
             root=state / "artifacts", ended=lambda _: None,
         )  # fmt: skip
         supervisor = SimpleNamespace(
-            state=state, adopts=True, reads_secrets=True,
+            state=state, adopts=True, reads_secrets=True, writes_files=True,
             start=lambda orders: self.started.extend(one.instance.process for one in orders),
         )  # fmt: skip
         endpoint = SimpleNamespace(
@@ -144,22 +142,6 @@ def test_a_fifo_is_no_parameter_file(slave, tmp_path):
     slave.launch(ProcessSpec("p", command=("true",), ros=True, parameter_sources=sources))
     slave.wait(lambda: slave.refused)
     assert f"parameters file '{fifo}': it is no regular file" in slave.refused["p"]
-
-
-def test_a_key_that_finds_no_room_is_written_later(slave, tmp_path):
-    """A full disk passes, so it refuses no start; a node that lacks its key is tried again."""
-    one, state = InstanceId("keyed", 1), tmp_path / "state"
-    slave.starter.instance_key = lambda _: b"k" * 32
-    with small_disk(state) as disk:
-        key_path(state, one).parent.mkdir()
-        disk.fill()
-        slave.launch(ProcessSpec(one.process, command=("true",)))
-        slave.wait(lambda: slave.started or slave.refused)
-        assert not slave.refused
-        assert not key_path(state, one).exists()
-        disk.make_room()
-        slave.starter.write_missing_keys()
-        slave.wait(key_path(state, one).exists)
 
 
 def test_a_start_for_which_no_thread_is_left_is_refused(slave, monkeypatch):

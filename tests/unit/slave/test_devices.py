@@ -313,7 +313,7 @@ def test_devices_in_arguments_and_parameters(tmp_path: Path) -> None:
     )  # fmt: skip
     assert launched.argv[1:3] == ("--source=/dev/video0", "{device.gpu}{x}")
     file = launched.argv[launched.argv.index("--params-file") + 1]
-    (parameters,) = yaml.safe_load(Path(file).read_text()).values()
+    (parameters,) = yaml.safe_load(launched.contents[file]).values()
     assert parameters["ros__parameters"] == {
         "source": "/dev/video0", "all": ["/dev/video0"], "rate": 5,
     }  # fmt: skip

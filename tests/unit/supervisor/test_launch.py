@@ -29,7 +29,7 @@ from rosrm.model.values import (
 )
 from rosrm.node.identity import identity_from
 from rosrm.slave.launch.ament_index import find_executable
-from rosrm.slave.launch.command import command_in_image, key_path, order_of, plain_launch, write_key
+from rosrm.slave.launch.command import command_in_image, order_of, plain_launch, write_files
 from rosrm.slave.launch.environment import (
     ProcessLocation,
     process_environment,
@@ -58,18 +58,24 @@ def shadow() -> Assignment:
     return Assignment(InstanceId("talker", 8), spec, 3, "talker_1700000000", shadow=True)
 
 
-def launched(tmp_path, given: Assignment, environment=None, python=sys.executable):
+def launched(tmp_path, given: Assignment, environment=None, python=sys.executable, where=HERE):
     """Return the launch order for an assignment."""
+    launchers = Launchers({"podman": MadeLauncher(InImage(), ())})
     plain = plain_launch(
-        given, environment or {}, python, where=HERE, state_directory=tmp_path,
-        launchers=Launchers(),
+        given, environment or {}, python, where=where, state_directory=tmp_path,
+        launchers=launchers,
     )  # fmt: skip
-    return order_of(plain, Launchers(), HERE.host)
+    return order_of(plain, launchers, where.host)
 
 
 def order(tmp_path, environment=None, **fields):
     environment = {"PATH": "/usr/bin", **(environment or {})}
     return launched(tmp_path, assignment(**fields), environment)
+
+
+def parameters(made):
+    """Return the content of the parameters file of an order."""
+    return yaml.safe_load(made.contents[made.argv[made.argv.index("--params-file") + 1]])
 
 
 class InImage:
@@ -172,8 +178,7 @@ def test_an_alias_names_the_node(tmp_path):
     """In a handoff the assignment has the node's name, not the spec."""
     made = launched(tmp_path, shadow())
     assert "__node:=talker_1700000000" in made.argv
-    (file,) = (tmp_path / "logs").glob("*.yaml")
-    assert yaml.safe_load(file.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
+    assert parameters(made) == {"/**": {"ros__parameters": {"rate": 10}}}
 
 
 def test_a_shadow_is_not_restarted(tmp_path):
@@ -272,11 +277,16 @@ def test_a_launch_that_the_system_refuses_ends_no_slave(tmp_path, prefix, fields
 
 
 @pytest.mark.parametrize(
-    "fields", [{"arguments": ("x" * LONGEST_LINE,)}, {"environment": {"BIG": "\0" * (2 << 20)}}]
+    "fields",
+    [
+        {"arguments": ("x" * LONGEST_LINE,)},
+        {"environment": {"BIG": "\0" * (2 << 20)}},
+        {"ros": True, "parameters": {"big": "x" * LONGEST_LINE}},
+    ],
 )
 def test_a_launch_that_is_too_long_for_the_supervisor_is_refused(tmp_path, fields):
     """The supervisor would refuse the connection, and the slave would end."""
-    with pytest.raises(LaunchError, match=r"talker#7: command line and .* have \d+ bytes"):
+    with pytest.raises(LaunchError, match=r"talker#7: command line, .* have \d+ bytes"):
         order(tmp_path, command=("node",), **fields)
 
 
@@ -326,7 +336,7 @@ def test_parameters_go_to_a_file_beside_the_log(tmp_path):
     made = order(tmp_path, command=("node",), ros=True, parameters={"rate": 10})
     path = tmp_path / "logs" / "talker.7.parameters.yaml"
     assert made.argv[-2:] == ("--params-file", str(path))
-    assert yaml.safe_load(path.read_text()) == {"/**": {"ros__parameters": {"rate": 10}}}
+    assert parameters(made) == {"/**": {"ros__parameters": {"rate": 10}}}
 
 
 def test_sources_of_parameters_are_merged_in_their_order(tmp_path):
@@ -343,9 +353,7 @@ def test_sources_of_parameters_are_merged_in_their_order(tmp_path):
     )  # fmt: skip
     given = shadow()
     spec = replace(given.spec, parameter_sources=sources)
-    launched(tmp_path, replace(given, spec=spec))
-    (made,) = (tmp_path / "logs").glob("*.yaml")
-    sections = yaml.safe_load(made.read_text())
+    sections = parameters(launched(tmp_path, replace(given, spec=spec)))
     assert list(sections) == ["/**", "/robot/other", "/robot/*", "/robot/talker_1700000000"]
     found = {nodes: section["ros__parameters"] for nodes, section in sections.items()}
     assert found["/**"] == {"rate": 2, "first": "a", "tolerance": 0.001, "on": True}
@@ -367,7 +375,7 @@ def test_nodes_that_keep_their_names_get_no_name(tmp_path):
         ),
     )  # fmt: skip
     assert made.argv[:3] == ("node", "--ros-args", "--params-file")
-    assert yaml.safe_load(Path(made.argv[3]).read_text()) == {"/a": {"ros__parameters": {"x": 1}}}
+    assert parameters(made) == {"/a": {"ros__parameters": {"x": 1}}}
     assert "ROSRM_NODE" not in made.environment
 
 
@@ -410,8 +418,7 @@ def test_directories_of_packages_are_those_of_the_host(tmp_path, prefix):
     there = f"{prefix}/share/demo_nodes"
     assert made.argv[:2] == (f"{prefix}/lib/demo_nodes/talker", f"--a={there}/a:{there}/b")
     assert made.working_directory == there
-    read = yaml.safe_load((tmp_path / "logs/talker.7.parameters.yaml").read_text())
-    assert read == {"/**": {"ros__parameters": {"maps": [f"{there}/m"], "a": 1}}}
+    assert parameters(made) == {"/**": {"ros__parameters": {"maps": [f"{there}/m"], "a": 1}}}
 
 
 @pytest.mark.parametrize(
@@ -572,31 +579,22 @@ def test_each_process_gets_the_key_of_its_instance_in_a_file(tmp_path):
     """A migratable node without one would take every message about a handoff as its master's.
 
     It may be in any process, also in one whose strategy moves no state of nodes. The environment,
-    which programs print and children inherit, does not have the key.
+    which programs print and children inherit, does not have the key; the launcher of a container
+    mounts the file.
     """
-
-    def write(instance):
-        assert write_key(instance, KEYED.instance_key(instance), tmp_path)
-        return str(key_path(tmp_path, instance))
-
-    here = replace(KEYED, key_file=write)
+    image = Container("image", "podman")
+    in_container = assignment(command=("x",), container=image)
     stateful = replace(assignment(command=("x",)), snapshots_from=1)
-    for one in (stateful, assignment(command=("sleep", "9"))):
-        made = process_environment(one, {}, here)
+    for one in (stateful, assignment(command=("sleep", "9")), shadow(), in_container):
+        made = launched(tmp_path, one, where=KEYED)
         assert "dGFsa2VyIzcg" not in str(made)
-        path = Path(made["ROSRM_INSTANCE_KEY_FILE"])
+        write_files(made.contents)
+        path = Path(made.environment["ROSRM_INSTANCE_KEY_FILE"])
         assert stat.S_IMODE(path.stat().st_mode) == 0o600
-        assert identity_from(made).key == b"talker#7".ljust(32)
-    assert "ROSRM_INSTANCE_KEY_FILE" in process_environment(shadow(), {}, here)
-    assert "ROSRM_INSTANCE_KEY_FILE" not in process_environment(stateful, made, HERE)
-
-
-def test_a_process_in_a_container_gets_its_key_in_a_file_too(tmp_path):
-    """Its launcher mounts the file; `podman inspect` shows the variables of a container."""
-    here = replace(KEYED, key_file=lambda _: "/state/p.key")
-    made = process_environment(assignment(command=("x",), container=Container("image")), {}, here)
-    assert made["ROSRM_INSTANCE_KEY_FILE"] == "/state/p.key"
-    assert "ROSRM_INSTANCE_KEY" not in made
+        assert identity_from(made.environment).key == str(one.instance).encode().ljust(32)
+        assert "ROSRM_INSTANCE_KEY" not in made.environment
+    without = launched(tmp_path, stateful, made.environment)
+    assert "ROSRM_INSTANCE_KEY_FILE" not in without.environment
 
 
 def test_the_identity_of_the_slave_is_not_inherited():

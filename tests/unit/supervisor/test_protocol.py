@@ -74,6 +74,8 @@ ORDERS = st.one_of(
         st.dictionaries(WORDS, WORDS),
         st.none() | ADOPTIONS,
         st.integers(0, 2**32),
+        st.lists(WORDS).map(tuple),
+        st.dictionaries(WORDS, WORDS),
     ),
     st.builds(StopOrdered, KEYS),
     st.builds(FenceOrdered, KEYS),
