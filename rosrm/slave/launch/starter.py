@@ -147,14 +147,9 @@ class Starter:
             if one.spec.artifacts:
                 self.artifacts.prepare(one, self._fetched)
         ready = self._start_prepared([one for one in wanted if not one.spec.artifacts], slots)
-        # Fetching files may take long, and the supervisor reports nothing before the start.
+        # A fetch or a sync may take long, and the supervisor reports nothing before the start.
         # Without this report the master would withdraw the assignment.
-        waiting = [
-            self.state.held[one.instance].status for one in wanted
-            if one not in ready and (one.snapshot_hosts or one.spec.artifacts)
-        ]  # fmt: skip
-        if waiting:
-            self.endpoint.publish_statuses(waiting, complete=False)
+        self._report(*(one for one in wanted if one not in ready))
 
     def _start_prepared(
         self, assignments: Sequence[Assignment], slots: int = 0

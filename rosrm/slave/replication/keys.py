@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import struct
+import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -36,23 +37,42 @@ class StateKeys:
     def __init__(self, directory_of: Callable[[str], Path]) -> None:
         self._directory_of = directory_of
         self._unsaved: dict[str, bytes] = {}
+        self._lock = threading.Lock()
 
     def put(self, process: str, number: int, key: bytes) -> None:
-        """Store the key of a process, in place of an earlier key.
+        """Take the key of a process, in place of an earlier key; may be called from any thread.
+
+        The next `save` stores the keys of all processes that start now, in the time of one of them.
 
         Args:
             process: name of the process.
             number: of the instance whose assignment has the key.
-            key: of the process; b"": delete the earlier key.
+            key: of the process.
+        """
+        with self._lock:
+            self._unsaved[process] = _RECORD.pack(number, key)
+
+    def save(self, process: str) -> None:
+        """Store the keys that were taken.
 
         Raises:
-            OSError: the file cannot be written; `of` tries again.
+            OSError: the key of this process cannot be written; `of` tries again.
         """
-        if key:
-            self._unsaved[process] = _RECORD.pack(number, key)
-            self._save(process)
-        else:
-            self._delete(process)
+        unsaved = dict(self._unsaved)
+        if process not in unsaved:
+            return
+        for one in unsaved:
+            with contextlib.suppress(OSError):  # of the file, too
+                self._directory_of(one).mkdir(mode=0o700, parents=True, exist_ok=True)
+        paths = {str(self._directory_of(one) / KEY): one for one in unsaved}
+        faults = durable.replace_all_durably({path: unsaved[one] for path, one in paths.items()})
+        with self._lock:
+            for path, one in paths.items():
+                if path not in faults and self._unsaved.get(one) == unsaved[one]:
+                    del self._unsaved[one]
+        for path, fault in faults.items():
+            if paths[path] == process:
+                raise fault
 
     def of(self, process: str) -> bytes:
         """Return the key of a process; b"": it has none.
@@ -62,8 +82,7 @@ class StateKeys:
                 its restart, this slave would send the snapshots without encryption.
             Damaged: the file holds no key.
         """
-        if process in self._unsaved:
-            self._save(process)
+        self.save(process)
         record = self._record_of(process)
         return b"" if record is None else record[1]
 
@@ -77,7 +96,7 @@ class StateKeys:
         except Damaged:
             record = (0, b"")
         if record is not None and record[0] <= up_to:
-            self._delete(process)
+            self.delete(process)
 
     def _record_of(self, process: str) -> tuple[int, bytes] | None:
         path = self._directory_of(process) / KEY
@@ -90,15 +109,11 @@ class StateKeys:
             raise Damaged(f"{path} holds no key") from None
         return number, key
 
-    def _save(self, process: str) -> None:
+    def delete(self, process: str) -> None:
+        """Delete the key of a process."""
         directory = self._directory_of(process)
-        directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-        durable.replace_durably(str(directory / KEY), self._unsaved[process])
-        del self._unsaved[process]
-
-    def _delete(self, process: str) -> None:
-        directory = self._directory_of(process)
-        self._unsaved.pop(process, None)
+        with self._lock:
+            self._unsaved.pop(process, None)
         with contextlib.suppress(OSError):
             for name in (KEY, f"{KEY}.new"):
                 (directory / name).unlink(missing_ok=True)

@@ -400,6 +400,8 @@ class ReplicationService:
                 self._looked(unkeyed, found, done)
 
         if instance in self._preparing:
+            if assignment.state_key:  # before the thread takes a search: one `save` for all
+                self._store.keys.put(instance.process, instance.number, assignment.state_key)
             self._in_thread(partial(self._look_for, assignment), looked, _Found(None, ""))
 
     def _look_for(self, assignment: Assignment) -> _Found:
@@ -412,7 +414,10 @@ class ReplicationService:
                 head.instance < assignment.snapshots_from for _, head in snapshot_files(directory)
             ):
                 drop_snapshots(directory, assignment.snapshots_from - 1)
-            self._store.keys.put(process, number, assignment.state_key)
+            if assignment.state_key:
+                self._store.keys.save(process)
+            else:
+                self._store.keys.delete(process)
             fault = self._store.open_replica(process, number)
             return _Found(self._store.newest_readable(process), fault)
         except OSError as error:

@@ -43,7 +43,12 @@ def test_a_restart_finds_the_files_of_the_order(host, damage):
     """
     path = host.state / "logs" / "p.1.parameters.yaml"
     order = host.order(
-        "p", "sh", "-c", f"cat {path}; exec sleep 1000", restart=ALWAYS, contents={str(path): CONTENT}
+        "p",
+        "sh",
+        "-c",
+        f"cat {path}; exec sleep 1000",
+        restart=ALWAYS,
+        contents={str(path): CONTENT},
     )
     client = host.connect()
     client.start([order])
