@@ -113,7 +113,7 @@ class JournalWriter:
 
     def _late(self, seconds: float) -> JournalLate:
         what = f"the disk has not answered for {seconds:.1f} s"
-        advice = "look for what keeps the disk busy; no acknowledged request is lost"
+        advice = "wait until it answers, or see what keeps it busy; no acknowledged request is lost"
         return JournalLate(
             f"the journal {self._path} cannot be used ({what}): {advice}",
             f"the journal of the master cannot be used ({what}); {advice}",
