@@ -60,6 +60,12 @@ _GREET_AGAIN: Final = 0.5
 _UNKNOWN_EPOCH: Final = 0
 #: Tickets that are kept until expired ones are removed.
 _MOST_INTRODUCTIONS: Final = 1000
+#: About a master that was discovered and has not answered.
+_IGNORED: Final = (
+    "A master was found there, and did not answer: it has just ended, or this key is not valid any "
+    "more, because the cluster's secret was replaced (`rosrm key rotate`, a master with another "
+    "secret) or the key was revoked."
+)
 #: Name of the master in messages.
 _MASTER: Final = "the master"
 
@@ -267,6 +273,9 @@ class MasterClient:
         settings = self._settings
         if hello is None:
             security, advice = _about_security(self._security.described)
+            greeted = self._clients.get(self._names(names.HANDSHAKE))
+            if greeted is not None and greeted.service_is_ready():
+                advice = f"{_IGNORED} {advice}"
             raise NoMaster(
                 f"no master answered within {clocks.boot_time() - begun:.1f} s "
                 f"({settings.describe()}, namespace {settings.namespace}, {security}). "

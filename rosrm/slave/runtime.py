@@ -103,6 +103,8 @@ _LOOK_AT_GRAPH: Final = 0.05
 _USAGE_PERIOD: Final = 1.0
 #: Seconds between two messages to the user that no master was found yet.
 _LOG_PERIOD: Final = 10.0
+#: The same between two warnings about a master that answers no handshake.
+_IGNORED_PERIOD: Final = 600.0
 #: Periods of readings for which a request stays valid at slow rates.
 _BEATS_MISSED: Final = 3
 
@@ -138,6 +140,7 @@ class SlaveRuntime:
         self._incarnation = _random_number()
         self._stopping = ""
         self._accepting = False
+        self._warn_at = 0.0
         self._learns = False
         max_age = max(config.control.max_age, _BEATS_MISSED * config.period)
         self._state = SlaveState(
@@ -428,6 +431,8 @@ class SlaveRuntime:
             if searches and now - logged_at >= _LOG_PERIOD:
                 logged_at = now
                 _log.info("looking for a master on %s", self._config.ros.describe())
+            if self._endpoint.is_ignored(now) and now >= self._warn_at:
+                self._warn_of_keys(now)
             self._work(now)
             wake = min(next_sample, next_usage, next_graph if awaited else next_sample)
             wake = min(wake, next_health) if self._health.watches else wake
@@ -441,6 +446,18 @@ class SlaveRuntime:
             if self._accepting:  # the last assignments are being launched: ask for more
                 self._endpoint.ask(now)
         guard.call(self._process.restore)  # so that the log has the end
+
+    def _warn_of_keys(self, now: float) -> None:
+        """Log that a master is there that does not answer this slave."""
+        self._warn_at = now + _IGNORED_PERIOD
+        _log.warning(
+            "a master on %s does not answer this slave: probably the key of this host is no longer "
+            "valid, because the cluster's secret was replaced (`rosrm key rotate`, a master with "
+            "another secret) or the key was revoked. `rosrm key list` on the machine of the master "
+            "shows the valid keys, and `rosrm key add host:%s` there makes a new one; then restart "
+            "this slave. It continues to look for a master",
+            self._config.ros.describe(), self._config.host,
+        )  # fmt: skip
 
     def _look_at_devices(self) -> None:
         """Report changes of the devices to the master, and lost ones to the core."""

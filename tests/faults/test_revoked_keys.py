@@ -15,7 +15,7 @@ from rosrm.keys import key_files
 from rosrm.model.values import HostLossPolicy
 from rosrm.ros.master_connection import MasterClient
 from tests.ros.clusters import host, job, service
-from tests.waiting import PATIENCE
+from tests.waiting import PATIENCE, wait_until
 
 SOON = {
     "liveness": LivenessSettings(suspect=0.6, lease=2.0),
@@ -102,4 +102,14 @@ def test_a_revoked_user_is_not_answered(cluster, monkeypatch, tmp_path: Path) ->
             ada.cancel(["adas"])
         with pytest.raises(NoMaster):
             ada.read_log("h0", "adas")
+    monkeypatch.setenv("ROSRM_KEY", str(file))
+    with pytest.raises(NoMaster, match="A master was found there, and did not answer"):
+        MasterClient.connect(cluster.ros, name="ada")
     assert cluster.process("adas").state == "running"
+
+
+def test_a_slave_names_a_replaced_secret_as_the_cause(cluster, tmp_path: Path) -> None:
+    """The master is there, and the slave cannot read one message of it."""
+    key("rotate", "--out", str(tmp_path / "new"))
+    said = "does not answer this slave: probably the key of this host is no longer valid"
+    wait_until(lambda: said in cluster.log_of("h0"), "the cause in the log", 2 * PATIENCE)

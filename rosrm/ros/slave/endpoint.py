@@ -69,6 +69,11 @@ _MOST_STRANGERS: Final = 2**32 - 1
 _LONGEST_BEAT_PERIOD: Final = 3600.0
 
 
+#: Seconds without an answer after which a master counts as one with other keys. The services of a
+#: killed master look ready for a shorter time, until its DDS lease ends.
+_IGNORED: Final = 25.0
+
+
 class MasterLink(Enum):
     """State of the connection to the master."""
 
@@ -136,6 +141,7 @@ class SlaveEndpoint:
         self._silent_since = math.inf  # -inf: the silence is logged
         self._strangers = 0
         self._strangers_at = -math.inf
+        self._unanswered_since = math.inf
         endpoints.refused = self._note_stranger
         participant = endpoints.participant
         self._control = ControlClient(participant, f"slave {description.name}")
@@ -177,13 +183,21 @@ class SlaveEndpoint:
         del topic
         self._strangers = min(self._strangers + 1, _MOST_STRANGERS)
 
+    def is_ignored(self, now: float) -> bool:
+        """Return True if a master is there that has answered no handshake for `_IGNORED`."""
+        searches = self.link in (MasterLink.SEARCHING, MasterLink.GREETING)
+        return searches and now - self._unanswered_since >= _IGNORED
+
     # --- finding the master --------------------------------------------------------------
 
     def advance(self, now: float) -> None:
         """Take the next step towards a registration; called in every cycle."""
         self._control.expire(now)
-        if self._should_greet(now) and self._clients[srv.Handshake].service_is_ready():
-            self._greet(now)
+        if self._should_greet(now):
+            if self._clients[srv.Handshake].service_is_ready():
+                self._greet(now)
+            else:
+                self._unanswered_since = math.inf
         if self.link is MasterLink.LISTENING and now - self._greeted_at >= _PATIENCE:
             self.link = MasterLink.SEARCHING
         if self.link is MasterLink.REGISTERED and self._missed(_MISSED_BEATS, now):
@@ -206,6 +220,7 @@ class SlaveEndpoint:
             self._greet_again = min(_GREET_GROWTH * self._greet_again, _PATIENCE)
         self.link = MasterLink.GREETING
         self._asked_at = now
+        self._unanswered_since = min(self._unanswered_since, now)
         request = srv.Handshake.Request(
             protocol_version=PROTOCOL_VERSION, software_version=__version__, role="slave",
             name=self.description.name,
@@ -217,6 +232,8 @@ class SlaveEndpoint:
 
     def _take_greeting(self, answer: srv.Handshake.Response | None, asked_at: float) -> None:
         now = clocks.boot_time()
+        if answer is not None:
+            self._unanswered_since = math.inf
         if self.link is not MasterLink.GREETING:
             return  # another of the repeated requests was answered first
         if answer is None or now - asked_at >= _PATIENCE:  # this process was stopped
