@@ -48,6 +48,17 @@ def fault_of(path: Path, error: sqlite3.Error | OSError) -> JournalError:
     return JournalError(beginning + DAMAGED)
 
 
+def removed(path: Path) -> JournalBlocked:
+    """Return the error for a file of the journal that was removed or replaced under the master."""
+    text = "was removed or replaced while the master runs, so nothing new would be kept"
+    return JournalBlocked(
+        f"{path} {text}. Move it back if it was moved. Otherwise copy the deleted journal and its "
+        f"-wal from /proc/{os.getpid()}/fd to {path.parent}, and restart the master. "
+        f"A master with an empty journal stops the processes that it does not know",
+        f"the journal of the master {text}. Its log says how to put the journal back",
+    )
+
+
 _NOTHING_LOST = "no acknowledged request is lost"
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from rosrm import clocks
-from rosrm.journal.errors import fault_of, no_journal, other_version
+from rosrm.journal.errors import fault_of, no_journal, other_version, removed
 from rosrm.journal.retention import Retention, Row
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.lazy import mapping_to_json
@@ -91,6 +91,23 @@ class SqliteJournal:
             lambda: Retention(self._database, keep_events, keep_bytes)
         )
         self._is_long = False
+        self._files: Mapping[str, tuple[int, int]] = self._guarded(self._identities)
+
+    def _identities(self) -> Mapping[str, tuple[int, int]]:
+        """Return device and inode of each file that the journal has; {}: none is found."""
+        found = {}
+        for path in (str(self._path), self._log):
+            with contextlib.suppress(FileNotFoundError):
+                status = os.stat(path)  # noqa: PTH116 - for each group
+                found[path] = (status.st_dev, status.st_ino)
+        return found
+
+    def _check_files(self) -> None:
+        """Raise `JournalBlocked` for a removed file; SQLite would write to it without an error."""
+        present = self._identities()
+        for path, identity in self._files.items():
+            if present.get(path) != identity:
+                raise removed(Path(path))
 
     def _open(self, sync: str) -> sqlite3.Connection:
         if self._path.is_file() and not self._path.stat().st_size:
@@ -191,7 +208,7 @@ class SqliteJournal:
     def _log_size(self) -> int:
         try:
             return os.stat(self._log).st_size  # noqa: PTH116 - for each group
-        except OSError:  # somebody has removed it; the next write fails
+        except OSError:  # removed: the next write fails
             return 0
 
     @property
@@ -215,6 +232,7 @@ class SqliteJournal:
         rows: Sequence[Row],
         intents: Mapping[tuple[str, str], Mapping[str, Any] | None],
     ) -> None:
+        self._check_files()
         database = self._database
         database.execute("BEGIN IMMEDIATE")
         try:

@@ -244,6 +244,21 @@ def test_a_locked_file_is_refused(path) -> None:
     holder.close()
 
 
+@pytest.mark.parametrize("name", ["", "journal.sqlite", "journal.sqlite-wal"])
+def test_nothing_is_acknowledged_that_a_removed_journal_would_lose(path, opened, name) -> None:
+    """SQLite itself writes on; once the file is back at its place, the journal continues."""
+    journal = opened()
+    journal.write([Record("kept")], [], 0.0)
+    place, aside = path.parent / name, path.parent.with_name("aside")
+    place.rename(aside)
+    for _ in range(2):
+        with pytest.raises(JournalBlocked, match="was removed or replaced while the master runs"):
+            journal.write([Record("late")], [], 1.0)
+    aside.rename(place)
+    journal.write([Record("late")], [], 2.0)
+    assert [one.record.kind for one in journal.records()] == ["kept", "late"]
+
+
 def test_a_full_disk_is_reported(path, opened) -> None:
     """Acknowledged writes stay; the message has the full disk and the remedy."""
     code = """
