@@ -135,6 +135,8 @@ class PluginCheck:
         items = [(str(node.value), node) for node in nodes] or list(named.items.items())
         for name, node in items:
             reads = self._registry.probes_of(name)
+            if not reads and self._registry.lost_probes():
+                continue  # one of them may read it
             if not reads:
                 note = f"unknown resource {name!r}{near(name, self._registry.resources())}"
                 note += " (resources of the probes that are installed here)"

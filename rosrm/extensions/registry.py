@@ -27,6 +27,7 @@ from rosrm.extensions.contracts import (
     MigrationStrategy,
     PeriodicImaging,
     PlacementFilter,
+    Probe,
     ProbeContext,
     ProbeOffer,
     ScoringOffer,
@@ -98,6 +99,11 @@ _NO_CAPABILITIES: Final = Capabilities()
 _MOST_ANSWERS: Final = 10_000
 
 _log = logging.getLogger("rosrm.plugins")
+
+#: Resources that have a limit by default, so a host that does not measure them gets no work.
+LIMITED: Final = ("cpu", "disk", "memory")
+#: Prefix of the name of a probe that stands for a broken plugin.
+_LOST: Final = "probes-of-"
 
 NameToOptions = Mapping[str, Mapping[str, Any]]
 T = TypeVar("T")
@@ -180,7 +186,16 @@ class Registry:
         return [cast(ProbeOffer, self.offer("probe", name)) for name in self.names("probe")]
 
     def default_probes(self) -> NameToOptions:
-        """Return the default probes of a host without configured ones, without options."""
+        """Return the default probes of a host without configured ones, without options.
+
+        A broken plugin that may have offered some counts as a probe that cannot be created, so the
+        host runs, reports the reason, and gets no work.
+
+        Raises:
+            ConfigError: none is installed.
+        """
+        for name, broken in self.lost_probes().items():
+            self._offers["probe", name] = _lost(name, broken)
         chosen = {offer.name: EMPTY for offer in self._probe_offers() if offer.default}
         if not chosen:
             raise ConfigError(
@@ -189,6 +204,20 @@ class Registry:
                 + self._broken_note("probe")
             )
         return chosen
+
+    def lost_probes(self) -> dict[str, Broken]:
+        """Return the broken plugins that may have offered default probes, each under a free name.
+
+        Empty if the other default probes read each resource that has a limit by default.
+        """
+        offers = [offer for offer in self._probe_offers() if offer.default]
+        read = {name for offer in offers if not _is_lost(offer) for name in offer.resources}
+        if read.issuperset(LIMITED):
+            return {}
+        might = [one for one in self._broken if one.kind in ("", "probe")]
+        return {
+            _LOST + re.sub(r"[^\w.-]", "-", one.name or one.source.plugin): one for one in might
+        }
 
     def rows(self, *kinds: PluginKind, host: str = "") -> list[PluginRow]:
         """Return one row for each offer and each fault of these kinds (without kinds: of all).
@@ -682,6 +711,20 @@ class Registry:
             return note
         many = counted(others, "plugin is", "plugins are")
         return f"{note} {many} broken{' besides' if note else ''}: see `rosrm plugins --local`."
+
+
+def _is_lost(offer: ProbeOffer) -> bool:
+    return offer.name.startswith(_LOST)
+
+
+def _lost(name: str, broken: Broken) -> Offered:
+    """Return the offer of a probe that stands for those of a broken plugin, and is not created."""
+
+    def create(_options: Any, _context: ProbeContext) -> Probe:
+        raise PluginError(broken.reason)
+
+    offer = ProbeOffer(name, create, summary=broken.reason, default=True, resources=LIMITED)
+    return Offered("probe", offer, broken.source)
 
 
 def _limit(seconds: float | None) -> float:

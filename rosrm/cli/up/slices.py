@@ -43,6 +43,9 @@ def slices(
         registry: the installed plugins, which measure this machine.
         directory: existing directory on the disk to be divided.
     """
+    lost = [f"{one.source}: {one.reason}" for one in registry.lost_probes().values()]
+    if lost:
+        raise ConfigError(f"this machine cannot be measured, so not divided: {'; '.join(lost)}")
     probes = registry.default_probes()
     divided = {name: options for name, options in probes.items() if name in _DIVIDED}
     shares = {name: free / count for name, free in _free(divided, registry, directory).items()}

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from rosrm.config.settings import DEFAULT_LIMITS
 from rosrm.errors import ConfigError, PluginError, SkipPlugin
 from rosrm.extensions.contracts import (
     CheckpointOffer,
@@ -315,6 +316,31 @@ def test_the_default_probes_are_those_that_say_so(context):
 def test_a_host_without_any_probe_must_say_so(context):
     with pytest.raises(ConfigError, match=r"no probe is installed.*rosrm-resources.*probes: \{\}"):
         Registry.of().probes(None, context)
+
+
+def broken_plugin() -> SimpleNamespace:
+    def register_probes():
+        raise ImportError("libnvml.so.1: cannot open shared object file")
+
+    return SimpleNamespace(register_probes=hookimpl(register_probes))
+
+
+@pytest.mark.parametrize("others", [{}, {"net": plugin(offered("net", default=True))}])
+def test_a_broken_plugin_leaves_no_host_unmeasured(context, others):
+    """Its default probes are not known, so the host runs, says why, and gets no work."""
+    registry = Registry.of(ours=broken_plugin(), **others)
+    (lost,) = (one for one in registry.probes(None, context).made if one.name != "net")
+    assert sorted(one.name for one in lost.resources) == sorted(DEFAULT_LIMITS)
+    with pytest.raises(PluginError, match=r"libnvml\.so\.1"):
+        lost.probe.read()
+    assert [row.state for row in registry.rows("probe") if row.name == lost.name] == ["broken"]
+    assert len(registry.probes(None, context).made) == 1 + len(others)
+
+
+def test_a_broken_plugin_beside_the_probes_of_all_limits_is_no_probe(context):
+    probes = offered("all", default=True, resources=tuple(DEFAULT_LIMITS))
+    registry = Registry.of(ours=broken_plugin(), good=plugin(probes))
+    assert list(registry.chosen_probes(None)) == ["all"]
 
 
 def test_an_unknown_probe_stops_the_slave_at_its_start(context):
