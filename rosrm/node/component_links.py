@@ -116,11 +116,11 @@ class ComponentLinks:
             node = self._make(str(request["plugin"]), list(request["arguments"]))
         try:
             restore_now(node)
-        except BaseException:
+            self._executor.add_node(node)
+        except BaseException:  # also an interrupt must leave no node that only the graph knows
             destroy(node, self._log.error)
             raise
         self.nodes.append(node)
-        self._executor.add_node(node)
         return node
 
     def _end(self, connection: socket.socket, node: Node) -> None:

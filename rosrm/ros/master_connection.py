@@ -262,7 +262,7 @@ class MasterClient:
         client = cls(settings, member, name, max(timeout, _REQUEST), joined)
         try:
             client._greet(timeout, begun)
-        except BaseException:
+        except BaseException:  # also an interrupt must leave no open participant
             client.close()
             raise
         return client
