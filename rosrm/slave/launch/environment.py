@@ -29,12 +29,14 @@ KEEP_EVERY: Final = "ROSRM_KEEP_EVERY"
 #: file that has the key, for all other processes.
 INSTANCE_KEY: Final = "ROSRM_INSTANCE_KEY"
 KEY_FILE: Final = "ROSRM_INSTANCE_KEY_FILE"
+#: Variable with the name of the launcher that has prepared the start of an instance.
+LAUNCHER: Final = "ROSRM_LAUNCHER"
 #: Variables that identify a process. A slave that was itself started by rosrm passes none of them
 #: on.
 _IDENTITY: Final = (
     "ROSRM_PROCESS", "ROSRM_INSTANCE", "ROSRM_HOST", "ROSRM_NODE", "ROSRM_STATE_CONFIG",
     "ROSRM_MASTER", "ROSRM_EPOCH", EPOCH_FILE, SHADOW, KEEP, KEEP_EVERY, INSTANCE_KEY, KEY_FILE,
-    INDEX_VARIABLE,
+    LAUNCHER, INDEX_VARIABLE,
     ARTIFACTS_VARIABLE, start_trace.VARIABLE,
 )  # fmt: skip
 

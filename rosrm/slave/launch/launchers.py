@@ -26,7 +26,8 @@ from rosrm.extensions.guard import guarded
 from rosrm.extensions.made import MadeLauncher
 from rosrm.extensions.plugin_calls import PluginCalls, given, implements, required, titled
 from rosrm.model.values import EMPTY, InstanceId, ProcessSpec
-from rosrm.supervisor.procfs import read_stat
+from rosrm.slave.launch.environment import LAUNCHER
+from rosrm.supervisor.procfs import read_environment, read_stat
 
 T = TypeVar("T")
 L = TypeVar("L")
@@ -71,6 +72,7 @@ class Launchers:
     awaited: frozenset[str] = frozenset()
     broken: dict[str, str] = field(init=False, default_factory=dict)
     _began: float = field(init=False, default_factory=clocks.boot_time)
+    _started_by: dict[int, tuple[int, str]] = field(init=False, default_factory=dict)
     _since: dict[str, float] = field(init=False, default_factory=dict)
     _locks: dict[str, threading.Lock] = field(init=False, default_factory=dict)
 
@@ -128,7 +130,9 @@ class Launchers:
                 faults.append(str(fault))
                 continue
             if prepared is not None:
-                return prepared
+                # The process itself tells a later run of the slave, which knows no specs.
+                environment = {**prepared.environment, LAUNCHER: name}
+                return replace(prepared, environment=environment)
         if restored:
             why = "; ".join(["no launcher here has an image of it", *faults])
             raise LaunchError(f"{instance} cannot be restored: {why}")
@@ -225,14 +229,23 @@ class Launchers:
     def _may_lack_launcher_of(self, leader: int) -> bool:
         """Return True if a launcher that is not created may have started an instance.
 
-        Only a former run of the slave may have started the instance by it.
+        Only a former run of the slave may have started the instance by it. The launcher may be
+        absent, broken or not installed by now, such as with another PATH.
         """
-        if not self.failing:
-            return False
-        with contextlib.suppress(OSError):  # no room for a look
+        try:
             stat = read_stat(leader)
-            return stat is None or stat.start / _TICKS < self._began
-        return True
+            if stat is None:  # it has ended
+                return bool(self.failing)
+            if stat.start / _TICKS >= self._began:
+                return False
+            known = self._started_by.get(leader)
+            if known is None or known[0] != stat.start:
+                known = self._started_by[leader] = stat.start, _launcher_in(leader)
+        except OSError:  # no room for a look
+            return True
+        name = known[1]
+        # Without a name no launcher has started it, or one of an earlier release.
+        return name not in self.made if name else bool(self.failing)
 
     def _of(self, contract: Callable[..., L]) -> Iterator[tuple[str, L]]:
         for name, one in self.made.items():
@@ -260,6 +273,20 @@ class Launchers:
         with contextlib.suppress(PluginError):  # the guard has recorded it
             return self.calls.ask("launcher", name, method, ask, launcher)
         return otherwise
+
+
+def _launcher_in(pid: int) -> str:
+    """Return the launcher that the environment of a process names; "": none.
+
+    Raises:
+        OSError: no look is possible now.
+    """
+    prefix = f"{LAUNCHER}=".encode()
+    try:
+        found = (one for one in read_environment(pid) if one.startswith(prefix))
+    except (FileNotFoundError, ProcessLookupError, PermissionError):  # ended, or of another user
+        return ""
+    return os.fsdecode(next(found, prefix).removeprefix(prefix))
 
 
 def _checked(launch: Launch, prepared: Launch) -> Launch:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import subprocess
 import time
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+from rosrm import clocks
 from rosrm.errors import CriuError, LaunchError
 from rosrm.extensions.contracts import Capabilities, Launch, LauncherOffer, MigrationOffer
 from rosrm.extensions.hookspecs import hookimpl
@@ -90,6 +92,22 @@ def test_a_restored_instance_is_launched_by_the_launcher_that_has_its_image():
     assert known.prepare(launch(restored=True)).argv == ("wrap", "x")
     with pytest.raises(LaunchError, match="no launcher here has an image of it"):
         launchers(first=Restorer()).prepare(launch(restored=True))
+
+
+@pytest.mark.parametrize(
+    ("usable", "departed", "members"), [({}, None, None), ({"ours": Restorer()}, False, ())]
+)
+def test_an_instance_of_an_absent_launcher_is_unknown_to_a_later_run(usable, departed, members):
+    """Its program may be missing from another PATH; its containers run on all the same."""
+    ours = launchers(ours=Restorer(7)).prepare(launch("ours")).environment
+    for environment, answers in ((ours, (departed, members)), ({}, (False, ()))):
+        with subprocess.Popen(["/bin/sleep", "1000"], env=dict(environment)) as sleeper:
+            pid = sleeper.pid
+            later = launchers(unusable={"ours": "absent: no such engine"}, **usable)
+            later._began = clocks.boot_time() + 1.0
+            seen = later.has_departed(pid), later.members(pid)
+            sleeper.kill()
+        assert seen == answers
 
 
 def test_a_missing_launcher_refuses_the_start_with_its_reason():
