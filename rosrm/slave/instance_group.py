@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from rosrm.model.values import InstanceId
-from rosrm.shortage import is_directory
+from rosrm.shortage import is_directory, raise_unless_absent
 from rosrm.supervisor.instance_groups import group_name, pids
 
 #: Control groups of a supervisor: version, directory and controllers of each.
@@ -96,17 +96,16 @@ def _content(path: str) -> str:
     """Return the content of a control file; "": there is none.
 
     Raises:
-        OSError: no file can be opened now.
+        OSError: no look is possible now.
     """
     if not path:
         return ""
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:  # the instance has ended
+        try:
+            return os.read(descriptor, 1 << 14).decode()
+        finally:
+            os.close(descriptor)
+    except OSError as error:  # the instance has ended, and its group is removed
+        raise_unless_absent(error)
         return ""
-    try:
-        return os.read(descriptor, 1 << 14).decode()
-    except OSError:  # the group was removed in between
-        return ""
-    finally:
-        os.close(descriptor)

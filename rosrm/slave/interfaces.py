@@ -58,6 +58,7 @@ class Traffic:
         self._classes = classes
         self._numbers: dict[tuple[str, str], int] = {}
         self._counted: dict[str, tuple[float, int, int]] = {}
+        self._last: dict[str, float] = {}
 
     def number(self, interface: str, host: str) -> int | None:
         """Return the number of an interface towards a host; None: there are too many.
@@ -88,17 +89,22 @@ class Traffic:
         return megabits * _BYTES_PER_MEGABIT if megabits > 0 else math.nan
 
     def _carried(self, name: str) -> float:
-        """Return the bytes a second of the busier direction since the last call; 0: unknown."""
+        """Return the bytes a second of the busier direction since the last call; 0: the first one.
+
+        After a failed look the last rate stays, because 0 would tell that the link is free.
+        """
         try:
             received, sent = (
                 int((self._classes / name / "statistics" / f"{way}_bytes").read_text())
                 for way in ("rx", "tx")
             )
         except (OSError, ValueError):
-            return 0.0
+            return self._last.get(name, 0.0)
         now = self._clock()
         then, *before = self._counted.get(name, (now, received, sent))
         self._counted[name] = (now, received, sent)
         if now <= then:
-            return 0.0
-        return max(0.0, received - before[0], sent - before[1]) / (now - then)
+            return self._last.get(name, 0.0)
+        carried = max(0.0, received - before[0], sent - before[1]) / (now - then)
+        self._last[name] = carried
+        return carried

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.component.link import container_of
-from rosrm.shortage import raise_shortage
+from rosrm.shortage import raise_unless_absent
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.launch.launchers import Launchers
 from rosrm.supervisor.procfs import descendants, inner_pid
@@ -229,16 +229,16 @@ def _content(path: str, most: int) -> bytes:
     """Return the first bytes of a file of a process; b"": the process has ended.
 
     Raises:
-        OSError: no file can be opened now.
+        OSError: no look is possible now.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY)
+        try:
+            return os.read(descriptor, most)
+        finally:
+            os.close(descriptor)
+    except PermissionError:  # it is hidden, as one of another user
+        return b""
     except OSError as error:
-        raise_shortage(error)
+        raise_unless_absent(error)
         return b""
-    try:
-        return os.read(descriptor, most)
-    except OSError:
-        return b""
-    finally:
-        os.close(descriptor)

@@ -36,6 +36,8 @@ _REMOVE_AGAIN: Final = 0.2
 _RETURN_AGAIN: Final = 1.0
 #: Links of a folder without folders in it.
 _LINKS: Final = 2
+#: More OOM kills than a group ever has, where their number before a run is not known.
+_UNKNOWN: Final = 2**53
 #: Bytes; a limit above this is none (version 1 writes 2**63 less a page).
 _NO_LIMIT: Final = 2**62
 
@@ -126,7 +128,7 @@ class InstanceGroups:
                     if controller in tree.controllers
                 )  # fmt: skip
         self._unset[key] = {name.removeprefix("limits."): 0.0 for name in faults}
-        self._kills_before[key] = 0 if is_new else self._kills(key)
+        self._kills_before[key] = 0 if is_new else self._kills(key, _UNKNOWN)
         return faults
 
     def _needs(self, tree: Tree, limits: LimitRule, *, realtime: bool) -> bool:
@@ -261,8 +263,11 @@ class InstanceGroups:
         return self._kills_before.get(key, 0)
 
     def out_of_memory(self, key: Key) -> tuple[float, float] | None:
-        """Return used bytes and limit (0: none) if the OOM killer ended a process of this run."""
-        if self._kills(key) <= self.kills_before(key):
+        """Return used bytes and limit (0: none) if the OOM killer ended a process of this run.
+
+        None: it did not, or that is not known.
+        """
+        if self._kills(key, 0) <= self.kills_before(key):
             return None
         tree = self._memory_tree(key)
         assert tree is not None
@@ -313,12 +318,16 @@ class InstanceGroups:
     def _memory_tree(self, key: Key) -> Tree | None:
         return next((t for t in self._made.get(key, ()) if "memory" in t.controllers), None)
 
-    def _kills(self, key: Key) -> int:
+    def _kills(self, key: Key, unknown: int) -> int:
+        """Return the number of OOM kills in the group of an instance, or another one if unknown."""
         tree = self._memory_tree(key)
         if tree is None:
             return 0
         name = "memory.oom_control" if tree.version == 1 else "memory.events"
-        return _counts(os.path.join(_path(tree, key), name)).get("oom_kill", 0)
+        try:
+            return _counts(os.path.join(_path(tree, key), name)).get("oom_kill", 0)
+        except OSError:
+            return unknown
 
 
 def remove_empty(group: str) -> None:
@@ -449,9 +458,12 @@ def _above(path: str, tree: Tree, limits: LimitRule) -> str:
     """
     if not limits.memory or tree.version == 1 or "memory" not in tree.controllers:
         return ""
-    used = _number(os.path.join(path, "memory.current"))
+    try:
+        used = float(cgroups.read(os.path.join(path, "memory.current")))
+        pages = _counts(os.path.join(path, "memory.stat")) if used > limits.memory else {}
+    except OSError as error:
+        return f"the usage of the control group {path} cannot be read: {reason_of(error)}"
     if used > limits.memory:
-        pages = _counts(os.path.join(path, "memory.stat"))
         used -= sum(pages.get(name, 0) for name in ("active_file", "inactive_file"))
     return _uses(used, limits) if used > limits.memory else ""
 
@@ -498,7 +510,7 @@ def _enter(path: str) -> None:
 
 
 def _number(path: str) -> float:
-    """Return the number in a control file; 0: none, or no limit."""
+    """Return the number in a control file, for a text; 0: not known, or no limit."""
     try:
         text = cgroups.read(path).strip()
     except OSError:
@@ -507,11 +519,8 @@ def _number(path: str) -> float:
 
 
 def _counts(path: str) -> dict[str, int]:
-    """Return the counts in a control file by name; {}: it cannot be read."""
-    try:
-        lines = cgroups.read(path).splitlines()
-    except OSError:
-        return {}
+    """Return the counts in a control file by name. Raises OSError."""
+    lines = cgroups.read(path).splitlines()
     return {name: int(count) for name, count in map(str.split, lines)}
 
 

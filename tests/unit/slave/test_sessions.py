@@ -1,5 +1,6 @@
 """Table of a slave's sessions, with a written process tree."""
 
+import errno
 import os
 import shutil
 
@@ -8,6 +9,7 @@ import pytest
 from rosrm.model.values import InstanceId
 from rosrm.slave.instance_group import InstanceGroup
 from rosrm.slave.sessions import SessionTable, SessionUsage
+from tests.failing_calls import nth_call_fails
 from tests.limits import no_more_files
 
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -178,6 +180,23 @@ def test_without_descriptors_the_last_usage_stays(tree, table):
     assert table.members(10) == (10,)
     table.refresh(2.0)
     assert table.usage() == {10: SessionUsage(pytest.approx(0.5), 100 * PAGE)}
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO])
+@pytest.mark.parametrize("version", [None, 2])
+def test_whichever_call_fails_the_usage_is_never_0(tree, table, tmp_path, number, version):
+    """A process or group that cannot be read has not ended."""
+    tree.put(10, 10, own=5.0, pages=100)
+    table.add(10, None if version is None else grouped(tmp_path, version, pids="10\n"))
+    table.refresh(0.0)
+    before = table.usage()[10].memory
+    for n in range(100):
+        with nth_call_fails(n, number) as count:
+            table.refresh(n + 1.0)
+        assert table.usage()[10].memory == before > 0
+        if not count.failed:
+            break
+    assert 2 < n < 100
 
 
 # --- control groups ---------------------------------------------------------------------------

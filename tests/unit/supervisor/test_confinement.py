@@ -20,6 +20,7 @@ from rosrm.supervisor.confinement import Confinement
 from rosrm.supervisor.group_trees import Tree
 from rosrm.supervisor.instance_groups import InstanceGroups, LimitRefused, limit_files
 from rosrm.supervisor.spawn_error import ScheduleRefused, SpawnError
+from tests.failing_calls import nth_call_fails
 from tests.starting import finish
 
 KEY = ("camera", 1)
@@ -356,6 +357,37 @@ def test_kills_of_an_earlier_run_are_not_reported(files) -> None:
     assert groups.out_of_memory(KEY) == (5e8, 5e8)
     (group / "memory.max").write_text("max\n")
     assert groups.out_of_memory(KEY) == (5e8, 0.0)
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO])
+def test_kills_that_cannot_be_counted_before_a_run_are_not_of_the_run(files, number) -> None:
+    """A count of 0 would report a kill of an earlier run as one of this run."""
+    groups, group = files
+    (group / "memory.events").write_text("oom_kill 2\n")
+    for n in range(50):
+        with nth_call_fails(n, number) as count:
+            groups.make(KEY, LimitRule(), realtime=False)
+        assert groups.out_of_memory(KEY) is None
+        if not count.failed:
+            break
+    assert 0 < n < 50
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.EIO])
+def test_a_limit_below_an_unknown_usage_is_refused(files, number) -> None:
+    """Version 2 accepts it, and kills processes of the group."""
+    groups, group = files
+    (group / "memory.current").write_text("500000000\n")
+    (group / "memory.stat").write_text("active_file 0\ninactive_file 0\n")
+    groups.make(KEY, LimitRule(), realtime=False)
+    for n in range(50):
+        (group / "memory.max").write_text("max")
+        with nth_call_fails(n, number) as count, pytest.raises(LimitRefused):
+            groups.change(KEY, LimitRule(), LimitRule(memory=1e8))
+        assert (group / "memory.max").read_text() == "max"
+        if not count.failed:
+            break
+    assert 0 < n < 50
 
 
 def test_a_group_that_was_made_ahead_gets_changed_limits(tmp_path: Path) -> None:
