@@ -120,6 +120,10 @@ class Start:
     restored: bool = False
     inactive: bool = False
 
+    def may_run_beside(self, node: str) -> bool:
+        """Return True if it cannot be taken for an owner of the name of a node that runs."""
+        return self.node_name not in ("", node) or self.restored or self.inactive
+
 
 @dataclass(frozen=True, slots=True)
 class AwaitReady:
@@ -278,7 +282,27 @@ def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
         fault = _handoff_fault(step)
         if fault:
             return fault
-    return _commit_fault(plan, move, aim)
+    return _commit_fault(plan, move, aim) or _overlap_fault(plan, move, aim)
+
+
+def _overlap_fault(plan: Plan, move: Move, aim: Aim) -> str:
+    """Return why a start would wait for the end of the source in vain; "" if none does.
+
+    Without an overlap the core delays a start of the same name until the source has ended. An
+    executor on its host may end the source.
+    """
+    if plan.overlap or aim is not Aim.MOVE:
+        return ""
+    for step in plan.steps:
+        ends = isinstance(step, Execute) and step.host == move.source_host
+        if ends or (isinstance(step, Stop) and step.instance == move.source):
+            return ""
+        if isinstance(step, Start) and not step.may_run_beside(move.spec.node):
+            return (
+                f"it starts {step.instance} under the name of the source before a Stop of the "
+                "source, and its overlap is 0 s: declare an overlap, or stop the source first"
+            )
+    return ""
 
 
 def _commit_fault(plan: Plan, move: Move, aim: Aim) -> str:

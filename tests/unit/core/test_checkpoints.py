@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -10,7 +11,7 @@ import pytest
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Command, SendOrder
 from rosrm.model.orders import AmendInstance, FenceInstance, StartInstance, StopInstance
-from rosrm.model.plan import Aim, Commit, Move, Plan, Start, Stop, plan_fault
+from rosrm.model.plan import Aim, Commit, Execute, Move, Plan, Start, Stop, plan_fault
 from rosrm.model.requester import Requester
 from rosrm.model.values import (
     HostLossPolicy,
@@ -621,8 +622,24 @@ MOVE = Move(process("p"), ONE, "a", TWO, "a", InstanceId("p", 3), 0, "p")
         (Aim.RESTORE, (START, Commit()), "without its image"),
         (Aim.RESTORE, (Commit(),), "never starts or awaits"),
         (Aim.MOVE, (START, Commit(image="x")), "commits to an image"),
+        (Aim.MOVE, (START, Commit(), Stop(ONE, "a", 1.0)), "its overlap is 0 s"),
+        (Aim.MOVE, (replace(START, node_name="p"), Commit()), "its overlap is 0 s"),
     ],
 )
 def test_an_unsound_plan_is_refused(aim: Aim, steps: Any, fault: str) -> None:
-    """Such a plan could run the source beside its image, or start a process from nothing."""
+    """It could run the source beside its image, start from nothing, or wait for the source."""
     assert fault in plan_fault(Plan(steps), MOVE, aim)
+
+
+@pytest.mark.parametrize(
+    ("steps", "overlap"),
+    [
+        ((START, Commit(), Stop(ONE, "a", 1.0)), 1.0),
+        ((Stop(ONE, "a", 1.0), START, Commit()), 0.0),
+        ((Execute("x.end", "a", {}, 1.0), START, Commit()), 0.0),
+        ((replace(START, node_name="p_2"), Commit()), 0.0),
+        ((replace(START, restored=True), Commit()), 0.0),
+    ],
+)
+def test_a_start_that_does_not_wait_for_the_source_is_sound(steps: Any, overlap: float) -> None:
+    assert plan_fault(Plan(steps, overlap), MOVE) == ""

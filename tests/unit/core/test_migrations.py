@@ -418,7 +418,7 @@ def steps_of(*kinds: type[Step], **fields: Any) -> Callable[[Move], Plan]:
             Commit: Commit(),
         }
         first, *others = (known[kind] for kind in kinds)
-        return Plan((replace(first, **fields), *others))
+        return Plan((replace(first, **fields), *others), overlap=1.0)
 
     return propose
 
@@ -442,7 +442,7 @@ def with_step(kind: Any, **fields: Any) -> Any:
         start = Start(move.destination, move.destination_host, 1.0)
         instance = {} if kind is Execute else {"instance": move.destination}
         step = kind(host=move.destination_host, timeout=1.0, **instance, **fields)
-        return Plan((start, step, Commit()))
+        return Plan((start, step, Commit()), overlap=1.0)
 
     return propose
 
@@ -628,7 +628,8 @@ def test_a_plan_with_a_text_that_no_message_can_hold_is_unsound() -> None:
 
     def odd(move: Move) -> Plan:
         there = move.destination, move.destination_host, 5.0
-        return Plan((Start(*there, remappings={"a": "\ud800"}), AwaitReady(*there), Commit()))
+        start = Start(*there, remappings={"a": "\ud800"})
+        return Plan((start, AwaitReady(*there), Commit()), overlap=5.0)
 
     cluster = moving_by(odd)
     reply = cluster.migrate("p")
@@ -647,14 +648,15 @@ def test_a_plan_of_a_class_of_the_plugin_is_journalled_as_a_plan() -> None:
         """A plan without further fields."""
 
     def with_field(move: Move) -> Plan:
-        return Noted(StartFirstOrStopFirst().propose(move).steps)
+        return Noted(StartFirstOrStopFirst().propose(move).steps, overlap=20.0)
 
     def without_field(move: Move) -> Plan:
-        return Named(StartFirstOrStopFirst().propose(move).steps)
+        return Named(StartFirstOrStopFirst().propose(move).steps, overlap=20.0)
 
     message = moving_by(with_field).migrate("p").message
     assert "an unsound plan: unknown note; allowed: steps, overlap, options" in message
     cluster = moving_by(without_field)
+    cluster.cut("b")  # so the move is still under way
     assert cluster.migrate("p").accepted
     assert {type(one.plan) for one in cluster.state.migrations.values()} == {Plan}
 
@@ -688,8 +690,8 @@ def test_a_plan_without_undo_leaves_no_instance_behind() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["b"])
 
 
-def test_a_start_under_the_same_name_waits_where_no_overlap_is_declared() -> None:
-    """A plan that would run two instances under one name waits, and is undone."""
+def test_a_start_under_the_same_name_needs_an_overlap() -> None:
+    """The start would wait for the end of the source, which the plan stops only later."""
 
     def overlapping(move: Move) -> Plan:
         there = move.destination, move.destination_host, 5.0
@@ -697,9 +699,9 @@ def test_a_start_under_the_same_name_waits_where_no_overlap_is_declared() -> Non
         return Plan((Start(*there, undo=Stop(*there)), Commit(), stop_source))
 
     cluster = moving_by(overlapping)
-    cluster.migrate("p")
-    assert cluster.where("p") == ["a"]
-    cluster.wait(12.0)
+    reply = cluster.migrate("p")
+    assert not reply.accepted
+    assert "before a Stop of the source, and its overlap is 0 s" in reply.message
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
 
 

@@ -210,8 +210,7 @@ def _in_the_way(state: MasterState, migration: Migration, step: Start, now: floa
     """
     process = state.processes[migration.process]
     back = migration.undo is not None
-    aliased = step.node_name not in ("", process.spec.node)
-    beside = migration.plan.overlap > 0.0 or aliased or step.restored or step.inactive
+    beside = migration.plan.overlap > 0.0 or step.may_run_beside(process.spec.node)
     if not back and beside:
         return False
     others = [one for one in state.instances_of(process) if one.id != step.instance]
