@@ -16,9 +16,9 @@ from typing import Any
 #: Built-in functions and methods that may lack memory, a descriptor, room on a disk or a process.
 #: A close, a signal and a wait for a child need nothing, and are not among them.
 CALLS = frozenset(
-    ["dup", "dup2", "epoll", "flock", "fork", "fstat", "fsync", "ftruncate", "listdir", "lstat",
-     "mkdir", "open", "pidfd_open", "pipe2", "pwrite", "read", "readlink", "register", "rename",
-     "replace", "rmdir", "scandir", "stat", "statvfs", "symlink", "unlink", "write"]
+    ["dup", "dup2", "epoll", "flock", "fork", "fork_exec", "fstat", "fsync", "ftruncate", "listdir",
+     "lstat", "mkdir", "open", "pidfd_open", "pipe2", "pwrite", "read", "readlink", "register",
+     "rename", "replace", "rmdir", "scandir", "stat", "statvfs", "symlink", "unlink", "write"]
 )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from rosrm.supervisor.spawn_error import SpawnError
 from rosrm_criu.control.client import directory_of, make_control_root
 from rosrm_criu.control.messages import VARIABLE, State, Status, read_message
 from rosrm_criu.engine import paths, process_tree, restart_from_image, restore_result, slots
-from rosrm_criu.engine.binary import find
+from rosrm_criu.engine.binary import CriuUnknownError, find
 from rosrm_criu.options import NAME, CriuOptions, OwnCriuOptions
 
 #: Most seconds for a restore; the master gives up sooner.
@@ -66,9 +66,14 @@ class CriuLauncher:
 
     @staticmethod
     def _criu(instance: InstanceId, restored: bool) -> Path | None:
-        """Return the program; None: there is none, and the instance starts without it."""
+        """Return the program; None: there is none, and the instance starts without it.
+
+        An instance without it has no images until its end, so a failed look starts none.
+        """
         try:
             return Path(find().command[-1])
+        except CriuUnknownError as error:
+            raise LaunchError(f"{instance} is not started without knowing CRIU: {error}") from None
         except CriuError as error:
             if not restored:
                 return None

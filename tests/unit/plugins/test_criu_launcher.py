@@ -13,7 +13,9 @@ import pytest
 from rosrm.errors import LaunchError, PortableError
 from rosrm.extensions.contracts import Launch, LauncherContext
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
+from rosrm_criu.engine.binary import PROGRAM_VARIABLE
 from rosrm_criu.launcher import CriuLauncher
+from tests.failing_calls import nth_call_fails
 from tests.limits import no_more_files
 
 
@@ -49,6 +51,31 @@ def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
     migration = MigrationPolicy("criu", options={"checkpoint_every": 10.0})
     with pytest.raises(LaunchError, match=f"'{program}' (is not on the PATH|exists)"):
         prepared(tmp_path, command=(program,), migration=migration)
+
+
+@pytest.mark.parametrize("number", [errno.EMFILE, errno.ENOMEM, errno.EIO])
+def test_an_instance_does_not_lose_its_images_to_a_failed_look_at_criu(
+    tmp_path, monkeypatch, number
+):
+    """It would have none until its end; the program is absent only if that is certain."""
+    program = tmp_path / "criu"
+    program.write_text("#!/bin/sh\necho Version: 4.1\n")
+    program.chmod(0o755)
+    monkeypatch.delenv(PROGRAM_VARIABLE, raising=False)
+    monkeypatch.setattr("rosrm_criu.engine.binary.default_prefix", lambda: tmp_path / "none")
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    migration = MigrationPolicy("criu", options={"checkpoint_every": 10.0})
+    prepared(tmp_path, migration=migration)  # loads the modules
+    for n in range(1000):
+        try:
+            with nth_call_fails(n, number) as count:
+                launch = prepared(tmp_path, migration=migration)
+        except (LaunchError, OSError):
+            continue
+        assert any(word.startswith("--criu=") for word in launch.argv)  # maybe of another folder
+        if not count.failed:
+            break
+    assert 5 < n < 1000
 
 
 def test_a_restored_instance_without_an_image_here_is_left_to_other_launchers(tmp_path):

@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 import re
 import select
-import shutil
 import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -24,6 +24,8 @@ from rosrm.errors import CriuError
 from rosrm.runtime.log_tail import last_lines
 from rosrm.runtime.signalling import send_to_group
 from rosrm.shortage import exists
+from rosrm.supervisor.spawn import find_executable
+from rosrm.supervisor.spawn_error import SpawnError, is_transient
 from rosrm.wording import ending_of, reason_of
 from rosrm_criu.engine.criu_log import causes, first_words
 
@@ -43,6 +45,10 @@ _LOOK: Final = 0.01
 _CAP_SYS_ADMIN: Final = 21  # linux/capability.h
 #: Folders that Debian uses for CRIU and that an ordinary user's PATH lacks.
 _PLACES: Final = "/usr/local/sbin:/usr/sbin:/sbin"
+
+
+class CriuUnknownError(CriuError):
+    """No look at CRIU is possible now, which does not tell that it is absent or does not work."""
 
 
 @dataclass(frozen=True)
@@ -121,26 +127,44 @@ def find(prefix: Path | None = None) -> CriuBinary:
 
     Raises:
         CriuError: none starts; the message names the places searched, and what to do.
+        CriuUnknownError: one may start, but cannot be tried now.
     """
     named = os.environ.get(PROGRAM_VARIABLE, "")
     if named:
         try:
             return opened(Path(named))
         except CriuError as error:
-            raise CriuError(
+            raise type(error)(
                 f"{PROGRAM_VARIABLE} names a CRIU that cannot be used: {error}"
             ) from None
     private = (default_prefix() if prefix is None else prefix) / PROGRAM
-    in_path = shutil.which("criu", path=f"{os.environ.get('PATH', '')}:{_PLACES}")
     broken = []
-    for place in (private, Path(in_path) if in_path else None):
-        if place is not None and exists(place):
-            try:
+    for look in (partial(_at, private), _in_path):
+        try:
+            if (place := look()) is not None:
                 return opened(place)
-            except CriuError as error:
-                broken.append(str(error))
+        except CriuUnknownError:
+            raise
+        except OSError as error:
+            raise CriuUnknownError(f"CRIU cannot be looked for now: {reason_of(error)}") from None
+        except CriuError as error:
+            broken.append(str(error))
     looked = f"looked for: {PROGRAM_VARIABLE} (not set), {private}, `criu` in PATH"
     raise CriuError("; ".join([*broken, f"there is no CRIU here ({looked})"]) + f". {REMEDY}")
+
+
+def _at(place: Path) -> Path | None:
+    return place if exists(place) else None
+
+
+def _in_path() -> Path | None:
+    path = f"{os.environ.get('PATH', '')}:{_PLACES}"
+    try:
+        return Path(find_executable("criu", {"PATH": path}))
+    except SpawnError as error:
+        if error.transient:
+            raise CriuUnknownError(f"CRIU cannot be looked for now: {error}") from None
+        return None
 
 
 #: Remedy in error messages if there is no CRIU.
@@ -148,7 +172,12 @@ REMEDY: Final = "`scripts/install_criu.sh` of rosrm's repository installs one in
 
 
 def opened(program: Path) -> CriuBinary:
-    """Return a program as a `CriuBinary`; raise `CriuError` if it does not answer like CRIU."""
+    """Return a program as a `CriuBinary`.
+
+    Raises:
+        CriuError: it does not answer like CRIU.
+        CriuUnknownError: it cannot be started now, or does not answer in time.
+    """
     try:
         answer = subprocess.run(
             [program, "--version"],
@@ -163,9 +192,10 @@ def opened(program: Path) -> CriuBinary:
         why = reason_of(error)
         if isinstance(error, FileNotFoundError) and exists(program):
             why = "the C library that it names is missing; if CRIU was moved, install it again"
-        raise CriuError(f"{program} cannot be started: {why}") from None
+        kind = CriuUnknownError if is_transient(error) else CriuError
+        raise kind(f"{program} cannot be started: {why}") from None
     except subprocess.TimeoutExpired:
-        raise CriuError(f"{program} --version did not answer within {_ANSWER:g} s") from None
+        raise CriuUnknownError(f"{program} --version did not answer within {_ANSWER:g} s") from None
     version = re.search(r"^Version:\s*v?(\d+(?:\.\d+)+)", answer.stdout, re.MULTILINE)
     if answer.returncode != 0 or version is None:
         line = (answer.stderr.strip() or answer.stdout.strip() or "nothing").splitlines()[-1]
