@@ -520,7 +520,7 @@ class Server:
         directory = launch.directory or paths.work_directory(self._state)
         return spawn.Program(
             launch.argv, environment, directory, launch.secrets, launch.limits.nice, self._files,
-            launch.files, launch.contents,
+            launch.files, launch.directory is None, launch.contents,
         )  # fmt: skip
 
     def _environment(self, launch: messages.Launch) -> dict[str, str]:

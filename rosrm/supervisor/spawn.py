@@ -56,6 +56,7 @@ class Program(NamedTuple):
         nice: niceness; 0: that of this process. Without the right to it, that of this process.
         files: soft limit of open descriptors; None: that of this process.
         named: words of `argv` that should name files in the directory.
+        is_default: the directory is the supervisor's own, in its state directory.
         contents: path to the content of a file of its instance.
     """
 
@@ -66,6 +67,7 @@ class Program(NamedTuple):
     nice: int = 0
     files: int | None = None
     named: tuple[str, ...] = ()
+    is_default: bool = False
     contents: Mapping[str, str] = {}
 
 
@@ -247,7 +249,7 @@ def _execute(
         tell(_STEP, f"the file {path!r}")
         instance_files.provide(path, content)
     tell(_STEP, f"the working directory {directory!r}")
-    _enter(directory)
+    _enter(directory, is_default=program.is_default)
     for word in program.named:
         tell(_STEP, f"the file {word!r} in its working directory {directory!r}")
         if _is_missing(word):
@@ -284,9 +286,17 @@ def _is_missing(path: str) -> bool:
     return False
 
 
-def _enter(directory: str) -> None:
+def _enter(directory: str, *, is_default: bool) -> None:
     try:
         os.chdir(directory)
+    except FileNotFoundError as error:
+        missing = f"the working directory {directory!r} cannot be entered: {reason_of(error)}"
+        removed = (
+            "the state directory of this host was removed under its supervisor, which therefore "
+            "starts nothing more. Its processes still run and can be cancelled: cancel them, then "
+            "stop the slave and start it again"
+        )
+        raise SpawnError(removed if is_default else missing) from None
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the path
         reason = reason_of(error)
         message = f"the working directory {directory!r} cannot be entered: {reason}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
+import shutil
 import signal
 import time
 from dataclasses import replace
@@ -15,6 +16,7 @@ import pytest
 from rosrm.core.supervisor.events import FailOrdered, StopOrdered
 from rosrm.model.values import InstanceState, RestartPolicy
 from rosrm.runtime import private_files, timer_slack
+from rosrm.supervisor import procfs
 from tests.waiting import PATIENCE, wait_gone, wait_until
 
 IGNORES_ALL = """
@@ -62,6 +64,18 @@ def test_a_file_that_its_working_directory_lacks_is_named_with_the_failure(
         else "a directory of rosrm's own, because it has no `working_directory`"
     )
     assert status.message.startswith(f"exit code 2; there was no './x.py' in {where}")
+
+
+def test_a_removed_state_directory_is_the_reason_of_a_refused_start(host, client):
+    """What runs goes on, and can be stopped."""
+    pid = host.sleeper(client, "old")
+    shutil.rmtree(host.state / "work")
+    status = host.run(client, host.order("new", "true"))
+    assert status.state is InstanceState.REFUSED
+    assert status.message.startswith("the state directory of this host was removed under its")
+    assert procfs.read_stat(pid) is not None
+    client.send(StopOrdered(("old", 1)))
+    host.ended(client, "old")
 
 
 def test_many_short_processes_at_once_leave_the_supervisor_alive(host, client):

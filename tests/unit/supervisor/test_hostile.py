@@ -229,6 +229,7 @@ def test_a_reason_names_no_path_of_the_state_directory(server, tmp_path):
     one = server()
     one._take_over()
     (tmp_path / "state/work").rmdir()
+    (tmp_path / "state/work").touch()
     ours, peer = socket.socketpair()
     with peer:
         talk(one, ours, peer, start_fields())
