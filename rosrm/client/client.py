@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Union, cast
 
 from rosrm import clocks
@@ -377,9 +378,9 @@ class Client:
             follow: True: then yield new events until the time-out.
             timeout: seconds of following; None: no limit.
         """
-        from rosrm.client.event_feed import EventFeed  # noqa: PLC0415 - only for events
+        from rosrm.client.event_feed import ALL, EventFeed  # noqa: PLC0415 - only for events
 
-        def ask(after: int, newest: int) -> Listing:
+        def ask(process: str, host: str, after: int, newest: int) -> Listing:
             def look(on_wait: Callable[[float], None]) -> Listing:
                 return self.list(
                     events=True, process=process, host=host, after=after, newest=newest,
@@ -389,11 +390,18 @@ class Client:
             return ask_until_answered(look, self._notify, deadline if follow else 0.0)
 
         deadline = deadline_after(timeout)
-        feed = EventFeed(ask, after, newest)
+        feed = EventFeed(partial(ask, process, host), after, newest)
         yield from feed.new()
+        if process or host:  # a selection lacks the event by which a journal gap is noticed
+            feed = EventFeed(partial(ask, "", ""), feed.listing.last_sequence, 0, feed.known)
         while follow and clocks.boot_time() < deadline:
+            events: Sequence[EventRow] = list(feed.new())
+            if events and (process or host):
+                new = {one.sequence for one in events}
+                selected = ask(process, host, min(new) - 1, ALL).events
+                events = [one for one in selected if one.sequence in new]
+            yield from events
             time.sleep(PERIOD)
-            yield from feed.new()
 
     def logs(
         self, process: str, *, tail: int = 0, since: float = 0.0, host: str = "",

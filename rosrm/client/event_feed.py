@@ -6,41 +6,53 @@ last known event once more, which shows whether the record is still the same.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
+from functools import partial
+from math import inf
 from typing import Final
 
+from rosrm.model.event_kinds import EventKind
 from rosrm.model.rows import EventRow, Listing
 from rosrm.model.values import EMPTY
 
 #: Number of known events that are remembered; a journal gap is shorter.
 _KNOWN: Final = 1000
 #: Number of events in one listing that leaves out none, as in `List.srv`.
-_ALL: Final = 2**32 - 1
+ALL: Final = 2**32 - 1
 
 
 class EventFeed:
-    """The events of one selection that a follower has not seen.
+    """The events of the cluster that a follower has not seen.
 
     Args:
-        ask: returns the newest selected events after a sequence, given that and their number.
+        ask: returns the newest events after a sequence, given that and their number. A selection
+            of them may lack the last known event, so a journal gap may go unnoticed.
         after: sequence of the last event that the follower has seen.
         newest: most events of the first request; 0: the default of the master.
-        last: the event `after`, as attribute `last` of an earlier feed; None: not known. Without
-            it a record that lost this event before the first request looks the same.
+        known: events that the follower has seen, as `known` or `last` of an earlier feed. Without
+            the event `after`, a record that lost it before the first request looks the same.
 
     Attributes:
         after: sequence of the last event that `new` has yielded.
+        listing: the newest answer of the master.
     """
+
+    listing: Listing
 
     def __init__(
         self, ask: Callable[[int, int], Listing], after: int, newest: int,
-        last: EventRow | None = None,
+        known: Iterable[EventRow] = (),
     ) -> None:  # fmt: skip
         self._ask = ask
         self.after = after
         self._newest = newest
-        self._known: dict[int, EventRow] = {} if last is None else {after: last}  # no facts
+        self._known = {one.sequence: one for one in known}  # without facts
+
+    @property
+    def known(self) -> Collection[EventRow]:
+        """Return the newest events that the follower has seen, without their facts."""
+        return self._known.values()
 
     @property
     def last(self) -> EventRow | None:
@@ -49,15 +61,16 @@ class EventFeed:
 
     def new(self) -> Iterator[EventRow]:
         """Yield the events since the last request."""
-        listing = self._ask(max(self.after - 1, 0), self._newest)
-        self._newest = _ALL
+        self.listing = listing = self._ask(max(self.after - 1, 0), self._newest)
+        self._newest = ALL
         events, last = listing.events, self.last
         first = [_bare(one) for one in events[:1]]
+        is_new: Callable[[EventRow], bool] = self._is_new
         if listing.last_sequence < self.after or (last is not None and last not in first):
-            is_new, events = self._is_new_in_other_record, self._ask(0, _ALL).events
+            events = self._ask(0, ALL).events
+            starts = (one.sequence for one in events if one.kind == EventKind.MASTER_STARTED)
+            is_new = partial(self._is_new_in_other_record, max(starts, default=inf))
             self.after = listing.last_sequence
-        else:
-            is_new = self._is_new
         for event in events:
             if is_new(event):
                 yield event
@@ -71,13 +84,18 @@ class EventFeed:
     def _is_new(self, event: EventRow) -> bool:
         return event.sequence > self.after
 
-    def _is_new_in_other_record(self, event: EventRow) -> bool:
-        """Return True unless an event was there before the record lost its newest ones."""
+    def _is_new_in_other_record(self, run: float, event: EventRow) -> bool:
+        """Return True unless an event was there before the record lost its newest ones.
+
+        `run`: sequence of the first event of the master's run, which has begun since then.
+        """
         if not self._known:
             return True
         if event.sequence >= min(self._known):
             return self._known.get(event.sequence) != _bare(event)
-        return event.wall_time > max(one.wall_time for one in self._known.values())
+        # The clock of a machine that has lost its power may be behind.
+        known = max(one.wall_time for one in self._known.values())
+        return event.sequence >= run or event.wall_time > known
 
 
 def _bare(event: EventRow) -> EventRow:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 from rosrm import clocks
 from rosrm.archive.layout import Source
+from rosrm.client.event_feed import EventFeed
 from rosrm.client.retrying import Notify
 from rosrm.client.waiting import ENDED
 from rosrm.errors import NoMaster, Refused
@@ -81,7 +82,7 @@ class LogCollector:
         self._every, self._rate = every, rate
         self._logs: dict[tuple[str, str], _Log] = {}
         self._up: frozenset[str] = frozenset()
-        self._sequence = 0
+        self._feed = EventFeed(self._list, 0, _EVENTS)
         self._said: dict[tuple[str, str], str] = {}
         self._silent: dict[str, float] = {}
 
@@ -92,7 +93,8 @@ class LogCollector:
             NoMaster: the master does not answer.
             OSError: the archive cannot be written. The next call continues where it stopped.
         """
-        self._take(self._list(master))
+        self._master = master
+        self._take()
         try:
             try:
                 self._collect_due(master)
@@ -113,7 +115,7 @@ class LogCollector:
             except NoMaster as error:
                 self._silent[host] = clocks.boot_time() + _SILENT
                 self._say((host, ""), str(error))
-                self._take(self._list(master))  # raises if the master does not answer
+                self._take()  # raises if the master does not answer
             except Refused as refusal:
                 self._settle(host, process, refusal)
             except OSError as error:
@@ -126,16 +128,15 @@ class LogCollector:
 
     # --- which logs ----------------------------------------------------------------------
 
-    def _list(self, master: MasterClient) -> Listing:
-        listing = master.list(
-            hosts=True, processes=True, events=True, after=self._sequence, newest=_EVENTS
-        )
-        if listing.last_sequence < self._sequence:  # another journal
-            listing = master.list(hosts=True, processes=True, events=True, newest=_EVENTS)
-        return listing
+    def _list(self, after: int, newest: int) -> Listing:
+        newest = min(newest, _EVENTS)
+        return self._master.list(
+            hosts=True, processes=True, events=True, after=after, newest=newest
+        )  # fmt: skip
 
-    def _take(self, listing: Listing) -> None:
-        self._sequence = listing.last_sequence
+    def _take(self) -> None:
+        events = list(self._feed.new())
+        listing = self._feed.listing
         up = frozenset(row.description.name for row in listing.hosts if row.state == "up")
         for at, log in list(self._logs.items()):
             log.live = 0
@@ -147,7 +148,7 @@ class LogCollector:
         listed = {row.name for row in listing.processes}
         for row in listing.processes:
             self._note_row(row)
-        for event in listing.events:
+        for event in events:
             self._note_event(event)
         self._logs = {
             at: log for at, log in self._logs.items() if at[1] in listed or log.due < _NEVER

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from rosrm import clocks
+from rosrm.client.event_feed import EventFeed
 from rosrm.client.retrying import PERIOD, Notify, ask_until_answered, deadline_after
 from rosrm.model.applications import ApplicationRow
 from rosrm.model.event_kinds import EventKind
@@ -236,11 +237,11 @@ def wait_for_migration(
         on_change: takes the row of the process with each change of its state.
         notify: takes a message when the master is silent.
     """
-    changes = _Changes(on_change)
+    changes, seen = _Changes(on_change), _Seen(master, after, lambda one: one.process == name)
 
     def look(on_wait: OnWait) -> WaitResult:
-        view = master.list(processes=True, events=True, process=name, after=after, on_wait=on_wait)
-        for event in view.events:
+        view = seen.look(on_wait)
+        for event in seen.events:
             if event.kind in _ENDINGS:
                 return WaitResult(_ENDINGS[event.kind], event=event, message=event.message)
         ours = [row for row in view.processes if row.name == name]
@@ -260,15 +261,14 @@ def wait_for_drain(
 
     The arguments are those of `wait_for_migration`.
     """
+    seen = _Seen(master, after, lambda one: one.host == host)
 
     def look(on_wait: OnWait) -> WaitResult:
-        view = master.list(
-            hosts=True, processes=True, events=True, host=host, after=after, on_wait=on_wait
-        )
+        view = seen.look(on_wait)
         row = next((row for row in view.hosts if row.description.name == host), None)
         staying = [row for row in view.processes if row.host == host and row.state not in ENDED]
         if row is not None and row.drained:
-            drained = [event for event in view.events if event.kind == EventKind.HOST_DRAINED]
+            drained = [event for event in seen.events if event.kind == EventKind.HOST_DRAINED]
             event = drained[-1] if drained else None
             message = event.message if event else f"{host} is drained"
             return WaitResult(not staying, processes=staying, event=event, message=message)
@@ -277,6 +277,33 @@ def wait_for_drain(
         return WaitResult(False, pending=[row.name for row in staying] or [host])
 
     return _look_until(look, timeout, notify)
+
+
+class _Seen:
+    """Hosts and processes of the cluster, and the selected events since a sequence.
+
+    Attributes:
+        events: the events, the oldest first.
+    """
+
+    def __init__(
+        self, master: MasterClient, after: int, selects: Callable[[EventRow], bool]
+    ) -> None:
+        self._master, self._selects = master, selects
+        self._on_wait: OnWait | None = None
+        self._feed = EventFeed(self._list, after, 0)
+        self.events: list[EventRow] = []
+
+    def look(self, on_wait: OnWait) -> Listing:
+        self._on_wait = on_wait
+        self.events += filter(self._selects, self._feed.new())
+        return self._feed.listing
+
+    def _list(self, after: int, newest: int) -> Listing:
+        return self._master.list(
+            hosts=True, processes=True, events=True, after=after, newest=newest,
+            on_wait=self._on_wait,
+        )  # fmt: skip
 
 
 def _look_until(

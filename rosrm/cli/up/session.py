@@ -8,6 +8,7 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Final
@@ -18,11 +19,12 @@ from rosrm.cli.output.plain import echo
 from rosrm.cli.output.tables import event_line
 from rosrm.cli.process import INTERRUPTED
 from rosrm.cli.up.cluster import UpCluster
+from rosrm.client.event_feed import EventFeed
 from rosrm.client.waiting import ENDED
 from rosrm.errors import ConfigError, NoMaster, Refused, RosrmError
 from rosrm.model.applications import Target
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.rows import EventRow
+from rosrm.model.rows import EventRow, Listing
 from rosrm.model.values import ProcessSpec
 from rosrm.ros.spec_digests import digest_of
 from rosrm.runtime.dispositions import handled
@@ -121,7 +123,7 @@ class _Signals:
 def _run(cluster: UpCluster, work: Sequence[Target]) -> None:
     cluster.start()
     _say(_ready(cluster))
-    after = cluster.client.list().last_sequence
+    feed = EventFeed(partial(_events, cluster), cluster.client.list().last_sequence, _ALL_NEW)
     work = [replace(one, specs=tuple(_sent(cluster, one.specs))) for one in work]
     _submit(cluster, [spec for one in work if not one.application for spec in one.specs])
     applications = [one for one in work if one.application]
@@ -129,8 +131,7 @@ def _run(cluster: UpCluster, work: Sequence[Target]) -> None:
         _say(cluster.client.apply(applications).message)
     while True:
         cluster.check_parts()
-        for event in _new_events(cluster, after):
-            after = event.sequence
+        for event in _new_events(cluster, feed):
             if event.kind in _SHOWN:
                 _print(event_line(event))
         cluster.client.spin(_PERIOD)
@@ -203,9 +204,13 @@ def _read_record(path: Path) -> dict[str, str]:
         ) from None
 
 
-def _new_events(cluster: UpCluster, after: int) -> Sequence[EventRow]:
+def _events(cluster: UpCluster, after: int, newest: int) -> Listing:
+    return cluster.client.list(events=True, after=after, newest=newest)
+
+
+def _new_events(cluster: UpCluster, feed: EventFeed) -> Sequence[EventRow]:
     try:
-        return cluster.client.list(events=True, after=after, newest=_ALL_NEW).events
+        return list(feed.new())
     except (NoMaster, Refused) as error:  # the request is valid, so any refusal may pass
         cluster.check_parts()  # the error of a master that has ended says more
         _say(str(error))

@@ -177,6 +177,21 @@ def test_former_hosts_are_found_by_their_events(rig):
     assert rig.chunks() == [(0, b"before\n")]
 
 
+def test_events_after_a_journal_gap_are_seen(rig):
+    """They have the sequences of events that the collector has seen, and the master has lost."""
+    rig.master.processes = [process(PROCESS, "finished", host=HOST)]
+    rig.master.note(kind="assigned", host=HOST)
+    rig.master.note(kind="finished", host=HOST)
+    rig.alpha.write(b"one\n")
+    rig.alpha.ended.add((PROCESS, 1))
+    rig.collect(2)
+    rig.alpha.write(b"two\n", 2)
+    rig.master.events.pop()
+    rig.master.note(kind="master_started")
+    rig.collect()
+    assert rig.chunks(2) == [(0, b"two\n")]
+
+
 def test_another_log_of_the_same_number_is_another_generation(rig):
     """The state directory of the host was removed; the new log may be shorter or longer."""
     rig.alpha.write(b"former %d\n" % 7 * 3)

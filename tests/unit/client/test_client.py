@@ -132,6 +132,45 @@ def test_followed_events_after_a_journal_gap_are_complete(
     assert list(again) == []
 
 
+def test_followed_events_of_one_process_after_a_journal_gap_are_complete(
+    client, master, monkeypatch
+):
+    """The last event that is still there is of another process."""
+    master.events = [event(1), event(2, process="other"), event(3, process="other"), event(4)]
+    news = [event(3, message="new"), event(4, process="other"), event(5, message="newer")]
+    looks = iter([master.events])
+
+    def later(seconds):
+        master.events = next(looks, master.events[:2] + news)
+
+    monkeypatch.setattr("time.sleep", later)
+    following = list(client.events(process="talker", follow=True, timeout=0.2))
+    assert following == [event(1), event(4), news[0], news[2]]
+
+
+@pytest.mark.parametrize("number", [1, 2, 6])
+def test_a_wait_sees_its_end_also_after_a_journal_gap(client, master, monkeypatch, number):
+    """The new events have sequences up to that of the request, which the master has lost."""
+    master.events = [event(one) for one in range(1, 5)]
+    master.processes = [process("a", "migrating")]
+    master.hosts = [host("alpha", draining=True)]
+    ends = [
+        event(3, "master_started"), event(4, "migrated", process="a"),
+        event(5, "host_drained", process="", host="alpha"),
+        *(event(6 + one) for one in range(number)),
+    ]  # fmt: skip
+
+    def later(seconds):
+        master.events = master.events[:2] + ends
+        master.hosts = [host("alpha", draining=True, drained=True)]
+
+    monkeypatch.setattr("time.sleep", later)
+    assert client.wait_for_migration("a", after=4, timeout=5.0).event == ends[1]
+    master.events = [event(one) for one in range(1, 5)]
+    master.hosts = [host("alpha", draining=True)]
+    assert client.wait_for_drain("alpha", after=4, timeout=5.0).event == ends[2]
+
+
 def test_events_that_are_not_followed_do_not_wait_for_a_master(client, master):
     master.fails = NoMaster("no answer")
     with pytest.raises(NoMaster):

@@ -68,8 +68,8 @@ class AlertService:
     ) -> None:  # fmt: skip
         self._file, self._outbox, self._connect = file, outbox, connect
         self._watch = Watch(file.alerts, outbox.active())
-        position = outbox.position()
-        self._feed = EventFeed(self._list, position or 0, _MOST_EVENTS, outbox.last_event())
+        position, last = outbox.position(), outbox.last_event()
+        self._feed = EventFeed(self._list, position or 0, _MOST_EVENTS, [last] if last else ())
         self._is_first = position is None
         self._client: Client | None = None
         self._answers = True
@@ -93,7 +93,7 @@ class AlertService:
 
     def _look(self) -> None:
         events = self._ask()
-        situation = None if events is None else situation_of(self._listing)
+        situation = None if events is None else situation_of(self._feed.listing)
         if events is None or self._is_first:  # what had happened before the first listing is old
             self._is_first = self._is_first and events is None
             events = ()
@@ -133,12 +133,11 @@ class AlertService:
         """Ask for the listing of the cluster, with its events after a sequence."""
         conditions = [alert.condition for alert in self._file.alerts]
         self._client = self._client or self._connect()
-        self._listing = self._client.list(
+        return self._client.list(
             hosts=any(isinstance(one, (Above, HostLost)) for one in conditions),
             processes=any(isinstance(one, (InState, Happens)) for one in conditions),
             events=True, after=after, newest=min(newest, _MOST_EVENTS),
         )  # fmt: skip
-        return self._listing
 
     def _ask(self) -> Sequence[EventRow] | None:
         """Return the events that have not been seen; None: the master does not answer."""

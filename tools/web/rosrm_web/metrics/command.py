@@ -22,6 +22,8 @@ from rosrm.wording import reason_of
 
 if TYPE_CHECKING:
     from rosrm.client.client import Client
+    from rosrm.client.event_feed import EventFeed
+    from rosrm.model.rows import Listing
     from rosrm_web.metrics.counting import EventMetrics
 
 #: Mode of the file: the node exporter runs as another user.
@@ -49,7 +51,9 @@ def metrics(
     With --textfile, the textfile collector of the node exporter reads them. `rosrm web` serves the
     same metrics at /metrics.
     """
+    from rosrm.client.event_feed import EventFeed
     from rosrm_web.metrics.counting import EventMetrics
+    from rosrm_web.watching import MOST_EVENTS
 
     period = seconds_of("--every", every) if every else 0.0
     if every and textfile is None:
@@ -57,36 +61,37 @@ def metrics(
     with connection.master(ctx, domain) as client:
         counted = EventMetrics() if period else None
         after = client.list().last_sequence if period else 0
+
+        def ask(after: int, newest: int) -> Listing:
+            return client.list(
+                hosts=True, processes=True, applications=True, plugins="failing",
+                events=counted is not None, after=after, newest=min(newest, MOST_EVENTS),
+            )  # fmt: skip
+
+        feed = EventFeed(ask, after, MOST_EVENTS)
         while True:
-            content, after = _look(client, counted, after, is_repeated=bool(period))
-            _write(content, textfile)
+            _write(_look(client, feed, counted), textfile)
             if not period:
                 return
             time.sleep(period)
 
 
-def _look(
-    client: Client, counted: EventMetrics | None, after: int, *, is_repeated: bool
-) -> tuple[bytes, int]:
-    """Return the metrics, and the sequence of the newest event."""
+def _look(client: Client, feed: EventFeed, counted: EventMetrics | None) -> bytes:
+    """Return the metrics; `counted`: counts the events of repeated looks."""
     from rosrm_web.metrics.exposition import exposition
-    from rosrm_web.watching import MOST_EVENTS
 
     begun = clocks.boot_time()
     try:
-        listing = client.list(
-            hosts=True, processes=True, applications=True, plugins="failing",
-            events=counted is not None, after=after, newest=MOST_EVENTS,
-        )  # fmt: skip
+        events = list(feed.new())
     except NoMaster:
-        if not is_repeated:
+        if counted is None:
             raise
-        return exposition(None, 0.0, counted), after
+        return exposition(None, 0.0, counted)
     if counted is not None:
-        counted.count(listing.events)
+        counted.count(events)
     seconds = clocks.boot_time() - begun
     load = client.master_load() if counted is not None else {}
-    return exposition(listing, seconds, counted, load), listing.last_sequence
+    return exposition(feed.listing, seconds, counted, load)
 
 
 def _write(content: bytes, textfile: Path | None) -> None:
