@@ -9,7 +9,16 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.runtime import durable
-from rosrm.snapshots.format import Block, Damaged, Head, checked, decoded_head, encoded_head
+from rosrm.shortage import status
+from rosrm.snapshots.format import (
+    Block,
+    Damaged,
+    Head,
+    Unreadable,
+    checked,
+    decoded_head,
+    encoded_head,
+)
 from rosrm.snapshots.reader import (
     COPY,
     HEAD_ROOM,
@@ -19,6 +28,7 @@ from rosrm.snapshots.reader import (
     content_of,
     head_of,
     paths_of,
+    snapshot_files,
 )
 
 #: A snapshot that is being written for a node before its start.
@@ -29,8 +39,8 @@ class SlotWriter:
     """Writer of a node's snapshots into its two slots in turn, never over the newest one.
 
     Args:
-        directory: directory of the process; created if it does not exist.        process: name of
-            the process.
+        directory: directory of the process; created if it does not exist.
+        process: name of the process.
         instance: number of the writing instance.
 
     Raises:
@@ -152,7 +162,11 @@ class CopyWriter:
         return head
 
     def finish(self) -> None:
-        """Replace the earlier replica by this one; raises `OSError`."""
+        """Force this replica to the disk, then replace the earlier one; raises `OSError`.
+
+        A loss of power leaves one of the two, because only the new name may be missing.
+        """
+        durable.sync(str(self.path))
         self.path.replace(self._directory / COPY)
         self._close()
 
@@ -190,6 +204,36 @@ def write_slot(directory: Path, content: bytes) -> None:
         raise
     finally:
         os.close(file)
+
+
+def drop_torn(directory: Path) -> list[Path]:
+    """Delete the slots that look newer than the newest complete one; return their paths.
+
+    A loss of power may leave the new header of a slot and not its new content. The header alone
+    would count as the newest snapshot, also before a replica on another host. A slot that its node
+    writes now stays.
+
+    Raises:
+        OSError: too many files are open, or memory is short.
+    """
+    torn = []
+    for path, _ in snapshot_files(directory):
+        before = status(path)
+        try:
+            checked(content_of(path))
+            break
+        except Unreadable:
+            continue
+        except Damaged:
+            if path.name in SLOTS and before is not None and _is_same(before, status(path)):
+                with contextlib.suppress(OSError):  # a read-only disk: nothing can start there
+                    path.unlink(missing_ok=True)
+                    torn.append(path)
+    return torn
+
+
+def _is_same(before: os.stat_result, after: os.stat_result | None) -> bool:
+    return after is not None and before.st_mtime_ns == after.st_mtime_ns
 
 
 def drop_snapshots(directory: Path, up_to: int) -> bool:

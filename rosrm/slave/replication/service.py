@@ -132,6 +132,8 @@ class ReplicationService:
         #: Searches to repeat, with the time of each.
         self._repeated: list[tuple[float, Callable[[], None]]] = []
         self._parts_waiting = 0
+        for path in self._store.drop_torn():
+            _log.warning("%s: incomplete since a loss of power, deleted", path)
         self._snapshots = self._store.scan()
         self._reported: tuple[SnapshotReport, ...] | None = None
         self._reported_at = 0.0

@@ -19,7 +19,7 @@ from rosrm.slave.replication.encryption import decrypted, encrypted
 from rosrm.slave.replication.keys import StateKeys
 from rosrm.snapshots.format import LARGEST_REPLICA, Damaged, Head, TransferPart, Unreadable
 from rosrm.snapshots.reader import COPY, head_of, newest_content, newest_head, snapshot_files
-from rosrm.snapshots.writer import CopyWriter, drop_snapshots, write_slot
+from rosrm.snapshots.writer import CopyWriter, drop_snapshots, drop_torn, write_slot
 from rosrm.wording import reason_of
 
 #: Seconds for which a snapshot stays in memory between reads of its parts, and the most bytes of
@@ -113,6 +113,14 @@ class SnapshotStore:
     def is_used(self) -> bool:
         """Return True if this host ever stored a snapshot."""
         return exists(self._root)
+
+    def drop_torn(self) -> list[Path]:
+        """Delete what a loss of power has torn of the snapshots; return the paths.
+
+        Raises:
+            OSError: the files cannot be read or deleted now.
+        """
+        return [path for directory in self._directories() for path in drop_torn(directory)]
 
     def scan(self) -> tuple[SnapshotReport, ...]:
         """Return the newest snapshot of each process.

@@ -521,6 +521,20 @@ def test_a_slave_that_is_found_late_still_provides_the_newest_snapshot(net):
     assert net.age("a") == (8, 990)
 
 
+def test_a_slot_that_a_loss_of_power_has_torn_counts_for_no_start(net):
+    """Its new header is on the disk, but not its content; a replica on another host is newer."""
+    net.write("a", 3)
+    net.write("b", 5)
+    net.write("a", 6)
+    torn = next(path for path, head in reader.snapshot_files(net.directory("a")))
+    torn.write_bytes(torn.read_bytes().replace(b"\6" * 10, b"\1" * 10))
+    net.add_all("ab")
+    assert [one.sequence for one in net.slaves["a"].states()] == [3]
+    assert "incomplete since a loss of power" in net.log.text
+    prepare(net, "a", assignment("b", "a"))
+    assert net.age("a") == (7, 5)
+
+
 def test_a_stateless_process_starts_at_once(net):
     """No host is asked for a snapshot."""
     stateless = Assignment(P7, ProcessSpec("p", command=("x",)), 1, "p", snapshot_hosts=("b",))

@@ -13,9 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rosrm.runtime import durable
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import MOST_CYCLES, Block, Damaged, decoded, encoded_head
-from rosrm.snapshots.writer import CopyWriter, SlotWriter, drop_snapshots
+from rosrm.snapshots.writer import CopyWriter, SlotWriter, drop_snapshots, drop_torn
 
 
 def blocks(*contents: bytes) -> list[Block]:
@@ -279,3 +280,41 @@ def test_a_file_that_cannot_be_read_is_not_dropped(tmp_path) -> None:
     with pytest.raises(OSError, match="directory"):
         drop_snapshots(tmp_path, 7)
     assert (tmp_path / "state.0").exists()
+
+
+# --- after a loss of power --------------------------------------------------------------------
+
+
+def test_a_new_header_without_its_content_hides_no_complete_snapshot(tmp_path):
+    """Also a replica counts again that is older than the torn slot."""
+    for sequence in (1, 2):
+        write(tmp_path, sequence, b"content %d" % sequence)
+    older, newer = sorted(tmp_path.iterdir(), key=lambda path: reader.head_of(path).age)
+    newer.write_bytes(newer.read_bytes().replace(b"content", b"former "))
+    assert drop_torn(tmp_path) == [newer]
+    assert drop_torn(tmp_path) == []
+    assert reader.newest_head(tmp_path).age == newest(tmp_path)[0] == (7, 1)
+    older.write_bytes(older.read_bytes()[:-1])
+    assert drop_torn(tmp_path) == [older]
+    assert reader.newest_head(tmp_path) is None
+
+
+def test_a_slot_that_is_being_written_is_not_torn(tmp_path, monkeypatch):
+    write(tmp_path, 1, b"old")
+    (slot,) = (path for path in tmp_path.iterdir() if path.stat().st_size)
+
+    def written_meanwhile(path):
+        os.utime(path, ns=(0, path.stat().st_mtime_ns + 1))
+        raise Damaged("half of it is new")
+
+    monkeypatch.setattr("rosrm.snapshots.writer.content_of", written_meanwhile)
+    assert drop_torn(tmp_path) == []
+    assert slot.exists()
+
+
+def test_a_replica_is_on_the_disk_before_it_replaces_the_earlier_one(tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(durable, "sync", lambda _: done.append("synced"))
+    monkeypatch.setattr(Path, "replace", lambda *_: done.append("replaced"))
+    write_copy(tmp_path, encoded_head("counter", 7, 1, blocks(b"x")) + b"x")
+    assert done == ["synced", "replaced"]
