@@ -2,7 +2,8 @@
 
 A real cluster is recorded. After each recorded call the legal states of ext4 and XFS are made, and
 the real reader of each part starts on each that differs from all before: the master's journal, the
-keys, the supervisor of the host. A fault is a promise of docs/faults.md that a state breaks.
+keys, the supervisor of each host, the snapshots of all hosts, the archive of logs. A fault is a
+promise of docs/faults.md that a state breaks.
 """
 
 from __future__ import annotations
@@ -12,14 +13,14 @@ import hashlib
 import random
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.crash.disk import Disk, FileSystem, State
-from benchmarks.crash.oracle import Oracle
+from benchmarks.crash.oracle import SNAPSHOTS, Oracle, directory_of
 from benchmarks.crash.recording import Recording
-from benchmarks.crash.scenario import record
+from benchmarks.crash.scenario import HOSTS, record
 from benchmarks.machine import parser, print_report, say
 from benchmarks.stopping import run
 
@@ -31,43 +32,56 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
     tried = {part: {kind.value: 0 for kind in FileSystem} for part in oracle.checks}
     faults: dict[str, dict[str, Any]] = {}
     seen: set[bytes] = set()
-    for kind, state in _states(recording, arguments):
-        for part in oracle.checks:
-            if (digest := _digest(state, part)) in seen:
-                continue
-            seen.add(digest)
-            tried[part][kind.value] += 1
-            for fault in oracle.faults(part, state):
-                known = faults.setdefault(f"{part}: {fault}", {"states": 0, "first": state.how})
-                known["states"] += 1
+    for kind, part, state in _states(recording, oracle.checks.keys() - {SNAPSHOTS}, arguments):
+        if (digest := _digest(state, part)) in seen:
+            continue
+        seen.add(digest)
+        tried[part][kind.value] += 1
+        for fault in oracle.faults(part, state):
+            known = faults.setdefault(f"{part}: {fault}", {"states": 0, "first": state.how})
+            known["states"] += 1
     return {"states": tried, "faults": faults}
 
 
 def _states(
-    recording: Recording, arguments: argparse.Namespace
-) -> Iterator[tuple[FileSystem, State]]:
-    """Yield the states of a share of the moments."""
+    recording: Recording, parts: Collection[str], arguments: argparse.Namespace
+) -> Iterator[tuple[FileSystem, str, State]]:
+    """Yield the states of a share of the moments, each with the part that it is of.
+
+    Each part has a disk of its own: no sync of another part forces anything to it.
+    """
     calls = list(recording.calls())
     draw = random.Random(arguments.seed)  # noqa: S311 - no secret
     for kind in FileSystem:
-        disk = Disk(kind, recording.attributes)
+        disks = {part: Disk(kind, recording.attributes, part) for part in sorted(parts)}
         for number, call in enumerate(calls, 1):
-            disk.apply(call)
-            if draw.random() < arguments.share:
-                yield from ((kind, state) for state in disk.states(draw, arguments.each))
+            changed = [part for part, disk in disks.items() if disk.apply(call)]
+            for part in changed:
+                if draw.random() < arguments.share:
+                    for state in disks[part].states(draw, arguments.each):
+                        yield kind, part, state
+                        yield from ((kind, SNAPSHOTS, one) for one in _losses(state, disks, draw))
             if number % 200 == 0:
                 say(f"benchmarks.crash: {kind.value}, call {number} of {len(calls)}")
 
 
+def _losses(state: State, disks: Mapping[str, Disk], draw: random.Random) -> Iterator[State]:
+    """Yield the snapshots of all hosts if one of them, or each, loses its power."""
+    hosts = {directory_of(host) for host in HOSTS}
+    if hosts.isdisjoint(state.lost):
+        return
+    (other,) = hosts.difference(state.lost)
+    for one in disks[other].running(), draw.choice(list(disks[other].states(draw, 6))):
+        yield state.beside(one).only(SNAPSHOTS)
+
+
 def _digest(state: State, part: str) -> bytes:
-    """Return a digest of one part of a state, with the answers that its user had."""
+    """Return a digest of a state, with the answers that its user had."""
     found = hashlib.blake2b(digest_size=16)
-    for path in sorted(state.entries):
-        if path.startswith(part):
-            found.update(f"{path}\\0".encode())
-            content = state.entries[path]
-            found.update(content if isinstance(content, bytes) else repr(content).encode())
-    found.update(repr(state.told).encode())
+    for path, content in sorted(state.entries.items()):
+        found.update(f"{path}\0".encode())
+        found.update(content if isinstance(content, bytes) else repr(content).encode())
+    found.update(repr((part, state.told, state.lost)).encode())
     return found.digest()
 
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 import os
 import random
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path, PurePosixPath
 from typing import Final
@@ -112,18 +112,34 @@ class State:
         attributes: path to mode and time.
         told: marks before the loss of power, in order.
         how: the point, the file system and the choices, for a report.
+        lost: directories of the disks that have lost their power.
     """
 
     entries: Mapping[str, bytes | str | None]
     attributes: Mapping[str, Attributes]
     told: tuple[str, ...]
     how: str
+    lost: tuple[str, ...] = ()
+
+    def only(self, folder: str) -> State:
+        """Return the part of this state that is below folders of this name."""
+        entries = {path: one for path, one in self.entries.items() if f"/{folder}/" in f"/{path}/"}
+        attributes = {path: one for path, one in self.attributes.items() if path in entries}
+        return replace(self, entries=entries, attributes=attributes)
+
+    def beside(self, other: State) -> State:
+        """Return this state together with that of another disk at the same moment."""
+        return State(
+            {**self.entries, **other.entries}, {**self.attributes, **other.attributes},
+            self.told, f"{self.how}; {other.how}", self.lost + other.lost,
+        )  # fmt: skip
 
     def write(self, directory: Path) -> None:
         """Make the state in a new directory."""
         directory.mkdir()
         for name, content in sorted(self.entries.items()):
             path = directory / name
+            path.parent.mkdir(parents=True, exist_ok=True)
             if content is None:
                 path.mkdir(mode=0o700, exist_ok=True)
             elif isinstance(content, str):
@@ -144,11 +160,16 @@ class Disk:
     Args:
         kind: of the file system.
         attributes: of each inode, at the end of the recording.
+        directory: the disk has only what is below it; other disks lose their power at other
+            moments.
     """
 
-    def __init__(self, kind: FileSystem, attributes: Mapping[int, Attributes]) -> None:
+    def __init__(
+        self, kind: FileSystem, attributes: Mapping[int, Attributes], directory: str = ""
+    ) -> None:
         self._kind = kind
         self._attributes = attributes
+        self._directory = directory
         self._names: list[dict[str, Node]] = [{}]  # after each change of names
         self._nodes: dict[int, Node] = {}
         self._directories: dict[str, int] = {}  # number of the last change in each
@@ -161,9 +182,15 @@ class Disk:
         """Return path to file of all that exists."""
         return self._names[-1]
 
-    def apply(self, call: Call) -> None:
-        """Apply the next call; raises `KeyError` for a file that no call has made."""
+    def apply(self, call: Call) -> bool:
+        """Apply the next call; return True if it changes this disk, or what a user knows.
+
+        Raises:
+            KeyError: no call has made the file.
+        """
         self._at += 1
+        if not self._is_here(call):
+            return False
         if call.kind == MARK:
             self._told.append(call.path)
         elif call.kind in "WT":
@@ -176,6 +203,14 @@ class Disk:
                 self.names[call.path].pending.append((0, None))
         elif call.kind != "U" or call.path in self.names:  # a socket is not recorded
             self._change_names(call)
+        return True
+
+    def _is_here(self, call: Call) -> bool:
+        if not self._directory or call.kind == MARK:
+            return True
+        if call.kind in "WTF":
+            return call.inode in self._nodes
+        return f"{call.path}/".startswith(f"{self._directory}/")
 
     def _force(self, node: Node) -> None:
         if node.durable is not None:
@@ -203,8 +238,7 @@ class Disk:
         elif call.kind == "L":
             names[target] = names[call.path]
         elif call.kind == "U":
-            names[call.path].named = number
-            del names[call.path]
+            names.pop(call.path).named = number
         elif call.kind == "R":
             touched.append(target)
             self._rename(names, call.path, target, number, exchanges=bool(call.flags & _EXCHANGE))
@@ -237,11 +271,18 @@ class Disk:
         for cut, data in [first, *rest][:most]:
             yield self._state(cut, data, draw)
 
-    def _state(self, cut: int, data: Data, draw: random.Random) -> State:
+    def running(self) -> State:
+        """Return what the running machine reads, as long as it keeps its power."""
+        state = self._state(len(self._names) - 1, Data.ALL, None)
+        return replace(state, how=f"{self._directory} runs", lost=())
+
+    def _state(self, cut: int, data: Data, draw: random.Random | None) -> State:
         names = self._names[cut]
         unsynced = [path for path, node in names.items() if node.pending]
-        other = draw.choice(unsynced) if len(unsynced) > 1 and draw.random() < 0.5 else ""
-        opposite = Data.ALL if data is not Data.ALL else draw.choice(list(Data)[:-1])
+        other, opposite = "", data
+        if draw is not None and len(unsynced) > 1 and draw.random() < 0.5:
+            other = draw.choice(unsynced)
+            opposite = Data.ALL if data is not Data.ALL else draw.choice(list(Data)[:-1])
         entries: dict[str, bytes | str | None] = {}
         for path, node in names.items():
             if node.durable is not None:
@@ -259,6 +300,7 @@ class Disk:
             },
             tuple(self._told),
             f"{how}, data {data.value}{but}",
+            (self._directory,),
         )
 
 

@@ -10,27 +10,33 @@ import contextlib
 import os
 import shutil
 import signal
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 from benchmarks.crash.disk import State
-from benchmarks.crash.scenario import HOST
+from benchmarks.crash.scenario import APPLICATION, COUNTER, HOSTS
 from rosrm import clocks
 from rosrm.archive.layout import read_segments
 from rosrm.archive.reader import LogArchive
 from rosrm.archive.retention import ArchiveLimits
 from rosrm.archive.writer import ArchiveWriter
+from rosrm.core.master.state.replicas import ReplicaIndex
 from rosrm.errors import RosrmError
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys import key_files
 from rosrm.model.rows import LogPart
 from rosrm.model.values import InstanceState
+from rosrm.slave.replication.store import SnapshotStore
 from rosrm.supervisor import procfs
 from rosrm.supervisor.client import SupervisorClient
 
 _PATIENCE: Final = 20.0
 _OTHER_BOOT: Final = "00000000-0000-0000-0000-000000000000"
+#: Part of a directory whose states are those of all hosts together.
+SNAPSHOTS: Final = "kept"
 _ENDED: Final = {"finished", "failed", "cancelled"}
 _UNSETTLED: Final = {InstanceState.STARTING, InstanceState.HELD, InstanceState.STOPPING}
 
@@ -46,12 +52,15 @@ class Oracle:
     def __init__(self, root: Path, effects: Path) -> None:
         self._root, self._effects = root, effects
         self._first = _lines(effects)
-        logs = root / "cluster" / "hosts" / HOST / "supervisor" / "logs"
-        self._logs = {path.name: path.read_bytes() for path in logs.glob("*.log")}
+        self._logs = {
+            path.name: path.read_bytes()
+            for path in root.glob("cluster/hosts/*/supervisor/logs/*.log")
+        }
         #: Part of the directory to the check of its reader.
         self.checks: Mapping[str, Callable[[State], Iterator[str]]] = {
-            "keys": self._keys, "cluster/master": self._journal,
-            f"cluster/hosts/{HOST}": self._host, "archive": self._archive,
+            "keys": self._keys, "cluster/master": self._journal, "archive": self._archive,
+            **{directory_of(host): partial(self._host, host) for host in HOSTS},
+            SNAPSHOTS: self._snapshots,
         }  # fmt: skip
 
     def faults(self, part: str, state: State) -> list[str]:
@@ -83,8 +92,10 @@ class Oracle:
             yield f"the master does not start: {error}"
             return
         with contextlib.closing(journal):
-            phases = {name: one["phase"] for name, one in journal.intents("process").items()}
+            processes = journal.intents("process")
+            phases = {name: one["phase"] for name, one in processes.items()}
             wanted = {one["wanted"] for one in journal.intents("application").values()}
+            versions = [one["specs"] for one in journal.intents("version").values()]
         for name in _told(state, "submitted") - phases.keys():
             yield f"{name} was accepted, and is not known"
         for name in _told(state, "ended"):
@@ -94,9 +105,17 @@ class Oracle:
         applied = max(map(int, _told(state, "applied")), default=0)
         if applied > max(wanted, default=0):
             yield f"version {applied} was applied, and {wanted} is wanted"
+        parts = [one for one in processes.values() if one["spec"].get("application") == APPLICATION]
+        for one in parts:
+            if not any(one["spec"] in specs for specs in versions):
+                yield f"{one['spec']['name']} is of no version of its application"
+        moves = [line.split() for line in state.told if line.startswith(("moving ", "moved "))]
+        for what, name, host in moves[-1:]:
+            if what == "moved" and name in processes and processes[name]["host"] != host:
+                yield f"{name} was moved to {host}, and is on {processes[name]['host']}"
 
-    def _host(self, state: State) -> Iterator[str]:
-        supervisor = self._root / "cluster" / "hosts" / HOST / "supervisor"
+    def _host(self, host: str, state: State) -> Iterator[str]:
+        supervisor = self._root / directory_of(host) / "supervisor"
         self._let_boot(supervisor)
         self._effects.write_text("")
         try:
@@ -109,10 +128,34 @@ class Oracle:
         finally:
             _kill(client, supervisor)
         for name, found in _lines(self._effects).items():
-            if name in _told(state, "ended"):
+            if name == COUNTER:
+                yield f"{name} runs again, before the master knows its newest snapshot"
+            elif name in _told(state, "ended"):
                 yield f"{name} has ended, and runs again"
-            elif found != self._first[name]:
-                yield f"{name} runs with other files: {found}, not {self._first[name]}"
+            elif not found <= self._first[name]:
+                yield f"{name} runs with other files: {found}, not one of {self._first[name]}"
+
+    def _snapshots(self, state: State) -> Iterator[str]:
+        """Choose the snapshot of the counter as a master and a slave do, and read it."""
+        index, stores = ReplicaIndex(), {}
+        for host in HOSTS:
+            stores[host] = SnapshotStore(self._root / directory_of(host) / SNAPSHOTS, 1 << 30)
+            stores[host].drop_torn()
+            index.replace(host, stores[host].scan(), 0.0)
+        told = [line.split()[1:] for line in state.told if line.startswith("kept ")]
+        replicas = [(int(number), int(sequence), host) for number, sequence, host in told]
+        reached = [one[:2] for one in replicas if directory_of(one[2]) not in state.lost]
+        # The name of the newest replica may be missing; then the one before it is there.
+        least = max([*reached, *(one[:2] for one in replicas[:-1])], default=(0, 0))
+        if COUNTER in _told(state, "cancelling"):
+            return
+        newest = max((one.age for one in index.of(COUNTER).values()), default=(0, 0))
+        if newest < least:
+            yield f"the newest snapshot of {COUNTER} is {newest}, and {least} was reported"
+        for host in index.hosts_of(COUNTER, 1)[:1]:
+            found = stores[host].newer_than(COUNTER, (0, 0))
+            if found is None or found[0].age < least:
+                yield f"the snapshot {newest} of {COUNTER} on {host} cannot be read"
 
     def _archive(self, _: State) -> Iterator[str]:
         """Continue each stored log as a collector does, and compare it with the log itself."""
@@ -164,16 +207,24 @@ class Oracle:
         yield f"not settled after {_PATIENCE:g} s: {sorted(waiting)}"
 
 
+def directory_of(host: str) -> str:
+    """Return the state directory of a host, below that of the recording."""
+    return f"cluster/hosts/{host}"
+
+
 def _told(state: State, verb: str) -> set[str]:
     """Return the names about which the user had this answer."""
     words = (line.split() for line in state.told)
-    return {name for what, name in words if what == verb}
+    return {name for what, name, *_ in words if what == verb}
 
 
-def _lines(effects: Path) -> dict[str, str]:
-    """Return the name of each process that has started to the checksums of its files."""
-    lines = effects.read_text().splitlines()
-    return {name: sums for name, _, sums in (line.partition(" ") for line in lines)}
+def _lines(effects: Path) -> dict[str, set[str]]:
+    """Return the name of each process that has started to what it was started with."""
+    found = defaultdict[str, set[str]](set)
+    for line in effects.read_text().splitlines():
+        name, _, sums = line.partition(" ")
+        found[name].add(sums)
+    return found
 
 
 def _kill(client: SupervisorClient, supervisor: Path) -> None:

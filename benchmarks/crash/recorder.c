@@ -169,29 +169,24 @@ static int opened(int file, int directory, const char *name, int flags) {
     va_end(more); \
   }
 
-int open(const char *name, int flags, ...) {
-  MODE(flags)
-  REAL(open);
-  return opened(real(name, flags, mode), AT_FDCWD, name, flags);
-}
+/* The C library has each call a second time, for offsets of 64 bits. */
+#define OPEN(function) \
+  int function(const char *name, int flags, ...) { \
+    MODE(flags) \
+    REAL(function); \
+    return opened(real(name, flags, mode), AT_FDCWD, name, flags); \
+  }
+OPEN(open)
+OPEN(open64)
 
-int open64(const char *name, int flags, ...) {
-  MODE(flags)
-  REAL(open64);
-  return opened(real(name, flags, mode), AT_FDCWD, name, flags);
-}
-
-int openat(int directory, const char *name, int flags, ...) {
-  MODE(flags)
-  REAL(openat);
-  return opened(real(directory, name, flags, mode), directory, name, flags);
-}
-
-int openat64(int directory, const char *name, int flags, ...) {
-  MODE(flags)
-  REAL(openat64);
-  return opened(real(directory, name, flags, mode), directory, name, flags);
-}
+#define OPENAT(function) \
+  int function(int directory, const char *name, int flags, ...) { \
+    MODE(flags) \
+    REAL(function); \
+    return opened(real(directory, name, flags, mode), directory, name, flags); \
+  }
+OPENAT(openat)
+OPENAT(openat64)
 
 ssize_t write(int file, const void *data, size_t size) {
   REAL(write);
@@ -209,33 +204,55 @@ ssize_t writev(int file, const struct iovec *parts, int count) {
   return done;
 }
 
-ssize_t pwrite(int file, const void *data, size_t size, off_t offset) {
-  REAL(pwrite);
-  ssize_t done = real(file, data, size, offset);
-  if (done > 0) written(file, data, (size_t)done, (uint64_t)offset);
-  return done;
+#define PWRITE(function, offset_type) \
+  ssize_t function(int file, const void *data, size_t size, offset_type offset) { \
+    REAL(function); \
+    ssize_t done = real(file, data, size, offset); \
+    if (done > 0) written(file, data, (size_t)done, (uint64_t)offset); \
+    return done; \
+  }
+PWRITE(pwrite, off_t)
+PWRITE(pwrite64, off64_t)
+
+/* Record each part of a vector for itself, so a loss of power may also leave a part of it. */
+static void scattered(int file, const struct iovec *parts, int count, ssize_t size, off64_t offset) {
+  for (int at = 0; at < count && size > 0; at++) {
+    size_t length = parts[at].iov_len < (size_t)size ? parts[at].iov_len : (size_t)size;
+    if (length > 0) written(file, parts[at].iov_base, length, (uint64_t)offset);
+    offset += (off64_t)length;
+    size -= (ssize_t)length;
+  }
 }
 
-ssize_t pwrite64(int file, const void *data, size_t size, off64_t offset) {
-  REAL(pwrite64);
-  ssize_t done = real(file, data, size, offset);
-  if (done > 0) written(file, data, (size_t)done, (uint64_t)offset);
-  return done;
-}
+#define PWRITEV(function, offset_type) \
+  ssize_t function(int file, const struct iovec *parts, int count, offset_type offset) { \
+    REAL(function); \
+    ssize_t done = real(file, parts, count, offset); \
+    scattered(file, parts, count, done, offset); \
+    return done; \
+  }
+PWRITEV(pwritev, off_t)
+PWRITEV(pwritev64, off64_t)
 
-ssize_t sendfile(int to, int from, off_t *offset, size_t count) {
-  REAL(sendfile);
-  ssize_t done = real(to, from, offset, count);
-  copied(to, done);
-  return done;
-}
+#define PWRITEV2(function, offset_type) \
+  ssize_t function(int file, const struct iovec *parts, int count, offset_type offset, int flags) { \
+    REAL(function); \
+    ssize_t done = real(file, parts, count, offset, flags); \
+    scattered(file, parts, count, done, offset); \
+    return done; \
+  }
+PWRITEV2(pwritev2, off_t)
+PWRITEV2(pwritev64v2, off64_t)
 
-ssize_t sendfile64(int to, int from, off64_t *offset, size_t count) {
-  REAL(sendfile64);
-  ssize_t done = real(to, from, offset, count);
-  copied(to, done);
-  return done;
-}
+#define SENDFILE(function, offset_type) \
+  ssize_t function(int to, int from, offset_type *offset, size_t count) { \
+    REAL(function); \
+    ssize_t done = real(to, from, offset, count); \
+    copied(to, done); \
+    return done; \
+  }
+SENDFILE(sendfile, off_t)
+SENDFILE(sendfile64, off64_t)
 
 ssize_t copy_file_range(int from, off64_t *in, int to, off64_t *out, size_t size, unsigned flags) {
   REAL(copy_file_range);
@@ -244,19 +261,15 @@ ssize_t copy_file_range(int from, off64_t *in, int to, off64_t *out, size_t size
   return done;
 }
 
-int ftruncate(int file, off_t size) {
-  REAL(ftruncate);
-  int done = real(file, size);
-  if (done == 0) resized(file, size);
-  return done;
-}
-
-int ftruncate64(int file, off64_t size) {
-  REAL(ftruncate64);
-  int done = real(file, size);
-  if (done == 0) resized(file, size);
-  return done;
-}
+#define FTRUNCATE(function, size_type) \
+  int function(int file, size_type size) { \
+    REAL(function); \
+    int done = real(file, size); \
+    if (done == 0) resized(file, size); \
+    return done; \
+  }
+FTRUNCATE(ftruncate, off_t)
+FTRUNCATE(ftruncate64, off64_t)
 
 int posix_fallocate64(int file, off64_t offset, off64_t size) {
   REAL(posix_fallocate64);
@@ -266,19 +279,15 @@ int posix_fallocate64(int file, off64_t offset, off64_t size) {
   return done;
 }
 
-int fsync(int file) {
-  REAL(fsync);
-  int done = real(file);
-  if (done == 0) forced(file);
-  return done;
-}
-
-int fdatasync(int file) {
-  REAL(fdatasync);
-  int done = real(file);
-  if (done == 0) forced(file);
-  return done;
-}
+#define SYNC(function) \
+  int function(int file) { \
+    REAL(function); \
+    int done = real(file); \
+    if (done == 0) forced(file); \
+    return done; \
+  }
+SYNC(fsync)
+SYNC(fdatasync)
 
 int renameat(int from, const char *source, int to, const char *target) {
   REAL(renameat);

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,6 +15,7 @@ from typing import Any, Final
 
 from benchmarks.crash.recording import Recording
 from benchmarks.hosts import with_journal
+from rosrm import clocks
 from rosrm.client.client import Client
 from rosrm.client.waiting import Until
 from rosrm.config.settings import HostConfig
@@ -21,18 +23,31 @@ from rosrm.config.work import processes_of
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.testing.local_cluster import LocalCluster
 
-HOST: Final = "host0"
+#: Names of the hosts; the second one takes work after the steps that need one host alone.
+HOSTS: Final = ("host0", "host1")
+#: Process with a state, whose snapshots have replicas.
+COUNTER: Final = "counter"
+_ROOT: Final = Path(__file__).resolve().parents[2]
 _PATIENCE: Final = 120.0
-_APPLICATION: Final = "map"
+#: Cycles of the counter between two looks at its replica.
+_CYCLES: Final = 8
+APPLICATION: Final = "map"
+_PARTS: Final = ("planner", "driver")
 _QUICK: Final = RolloutPolicy(healthy_for=0.5)
-#: Program of each process: it tells what it found, and a service runs on.
+#: Program of each process but the counter: it tells what it found, and a service runs on.
 _PROGRAM: Final = """#!/bin/sh
 name=${ROSRM_INSTANCE%%#*} then=$1 effects=$2 artifact=$3
 while [ $# -gt 0 ]; do [ "$1" = --params-file ] && parameters=$2; shift; done
-echo "$name" $(cat $parameters /dev/null | cksum) $(cat $artifact /dev/null | cksum) >> "$effects"
+sums="$(cat $parameters /dev/null | cksum) $(cat $artifact /dev/null | cksum)"
+echo "$name" "$then" $sums >> "$effects"
 for n in 1 2 3; do seq -f "line %g of $name" 150; sleep 0.1; done
 [ "$then" = end ] && exit 0
 exec sleep 1000
+"""
+#: The counter, with 5 cycles a second.
+_COUNTER: Final = f"""
+echo {COUNTER} counts >> "$0" && cd '{_ROOT}' &&
+exec '{sys.executable}' -m benchmarks.handoff_nodes count --rate 5 "$@"
 """
 
 
@@ -76,7 +91,6 @@ class Scenario:
         self._recording = recording
         self._cluster = cluster
         self._places = places
-        self._host = cluster.hosts[0]
         self._client = Client(connection=cluster.client)
         self._archive = recording.root / "archive"
 
@@ -92,7 +106,7 @@ class Scenario:
             try:
                 yield
             finally:
-                one.send_signal(signal.SIGINT)
+                one.terminate()  # SIGINT is ignored in the background
 
     def _play(self) -> None:
         self._keys()
@@ -101,6 +115,7 @@ class Scenario:
         self._nodes()
         self._versions()
         self._restarts()
+        self._moves()
         self._stops()
 
     def _keys(self) -> None:
@@ -129,11 +144,19 @@ class Scenario:
 
     def _versions(self) -> None:
         for version in (1, 2):
-            (spec,) = processes_of(self._places.process("planner", then=f"run-{version}"))
-            spec = replace(spec, application=_APPLICATION)
-            self._client.apply_targets([Target(_APPLICATION, (spec,), rollout=_QUICK)])
+            options = {"ros": True, "readiness": "running", "parameters": {"version": version}}
+            parts = (
+                self._places.process(name, then=f"run-{version}", **options) for name in _PARTS
+            )
+            specs = (
+                replace(spec, application=APPLICATION)
+                for part in parts for spec in processes_of(part)
+            )  # fmt: skip
+            self._client.apply_targets([Target(APPLICATION, tuple(specs), rollout=_QUICK)])
             self._recording.mark(f"applied {version}")
-            self._client.wait_for_applications(_APPLICATION, timeout=_PATIENCE)
+            if not self._client.wait_for_applications(APPLICATION, timeout=_PATIENCE):
+                raise RuntimeError(f"version {version}: {self._client.list_applications()}")
+            self._recording.mark(f"reached {version}")
 
     def _restarts(self) -> None:
         master = self._cluster.master
@@ -144,13 +167,57 @@ class Scenario:
         self._cluster.wait_for_hosts(_PATIENCE)
         self._submit([self._places.process("late", then="end")])
         self._wait("late", "ended")
-        slave = self._cluster.slaves[HOST]
+        slave = self._cluster.slaves[HOSTS[0]]
         slave.end(signal.SIGKILL)
         slave.process.wait(_PATIENCE)
-        self._cluster.start_slave(self._host)
+        self._cluster.start_slave(host_config(HOSTS[0]))
         self._cluster.wait_for_hosts(_PATIENCE)
         self._submit([self._places.process("later", then="end")])
         self._wait("later", "ended")
+
+    def _moves(self) -> None:
+        """Move a process with a state from host to host, and back, with replicas on the other."""
+        self._cluster.start_slave(host_config(HOSTS[1]))
+        self._cluster.wait_for_hosts(_PATIENCE)
+        counter = {
+            "name": COUNTER, "command": ["sh", "-c", _COUNTER, str(self._places.effects)],
+            "ros": True, "migration": {"strategy": "handoff"},
+        }  # fmt: skip
+        self._submit([counter])
+        self._wait(COUNTER, "runs")
+        for _ in HOSTS:
+            self._await_replicas()
+            source = self._client.get_process(COUNTER).host
+            destination = next(name for name in HOSTS if name != source)
+            since = self._client.list().last_sequence
+            self._recording.mark(f"moving {COUNTER} {destination}")
+            self._client.migrate(COUNTER, destination)
+            if not self._client.wait_for_migration(COUNTER, after=since, timeout=_PATIENCE):
+                raise RuntimeError(f"no move: {self._client.explain(COUNTER)}")
+            self._recording.mark(f"moved {COUNTER} {destination}")
+        self._await_replicas()
+        self._recording.mark(f"cancelling {COUNTER}")
+        self._client.cancel(COUNTER)
+        self._wait(COUNTER, "ended")
+
+    def _await_replicas(self) -> None:
+        """Wait until the other host has reported two replicas, one some cycles after the other."""
+        newest, deadline = 0, clocks.boot_time() + _PATIENCE
+        for _ in range(2):
+            while not (found := self._replica(newest + _CYCLES)):
+                if clocks.boot_time() >= deadline:
+                    raise RuntimeError(f"no replica within {_PATIENCE:g} s: {self._replica(0)}")
+                time.sleep(0.1)
+            newest = found[1]
+            self._recording.mark(f"kept {' '.join(map(str, found))}")
+
+    def _replica(self, sequence: int) -> tuple[int, int, str] | None:
+        """Return number, sequence and host of the counter's replica, if it has enough cycles."""
+        home = self._client.get_process(COUNTER).host
+        for one in self._client.explain(COUNTER)["kept"]:
+            if one["host"] != home and one["sequence"] >= sequence:
+                return one["number"], one["sequence"], one["host"]
+        return None
 
     def _stops(self) -> None:
         self._client.cancel("node1")
@@ -187,22 +254,24 @@ def _variables(variables: dict[str, str]) -> Iterator[None]:
                 os.environ[name] = value
 
 
+def host_config(name: str) -> HostConfig:
+    """Return the settings of a host."""
+    return HostConfig(
+        host=name, scope="slice", max_processes=5,
+        budget={"memory": 2.0**34, "cpu": 64.0}, probes={"memory": {}, "cpu": {}},
+    )  # fmt: skip
+
+
 def record(folder: Path) -> tuple[Recording, Path]:
     """Play the scenario in a new folder; return its recording, and the file of the effects."""
     recording, places = Recording(folder / "disk", folder), Places.make(folder)
-    recording.make("cluster/", "cluster/master.log", f"cluster/{HOST}.log")  # for their output
+    logs = [f"cluster/{name}.log" for name in ("master", *HOSTS)]
+    recording.make("cluster/", *logs)  # for their output
     keys = {"ROSRM_KEYS": str(recording.root / "keys")}
-    hosts = [
-        HostConfig(
-            host=HOST, scope="slice", max_processes=4,
-            budget={"memory": 2.0**34, "cpu": 64.0}, probes={"memory": {}, "cpu": {}},
-        )
-    ]  # fmt: skip
+    directory, settings = recording.root / "cluster", with_journal("full")
     with (
         _variables({**recording.environment, **keys}),
-        LocalCluster(
-            recording.root / "cluster", cluster=with_journal("full"), hosts=hosts
-        ) as cluster,
+        LocalCluster(directory, cluster=settings, hosts=[host_config(HOSTS[0])]) as cluster,
     ):
         cluster.wait_for_hosts(_PATIENCE)
         Scenario(recording, cluster, places).play()
