@@ -442,11 +442,13 @@ class KeepSettings:
         every: seconds by which a node's snapshot on this host may be older than its state.
         max_bytes: largest total size, in bytes, of replicas of other hosts' processes on this host.
         max_rate: highest total rate of transfers to other hosts, in bytes a second.
+        wait: seconds for which a start waits for each host with a newer snapshot to answer.
     """
 
     every: Seconds = 1.0
     max_bytes: Annotated[int, Quantity("size", low=0, whole=True)] = 1_000_000_000
     max_rate: Annotated[int, Quantity("size", low=65536, whole=True)] = 10_000_000
+    wait: Seconds = 10.0
 
 
 @dataclass(frozen=True, slots=True)

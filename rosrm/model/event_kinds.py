@@ -43,7 +43,10 @@ class EventKind(str, Enum):
     # --- processes -----------------------------------------------------------------------
 
     SUBMITTED = "submitted", "a client submitted the process"
-    ASSIGNED = "assigned", "a host was chosen for the process; facts: the decision"
+    ASSIGNED = (
+        "assigned",
+        "a host was chosen; facts: the decision, the newest snapshot",
+    )
     WAITS = "waits", "the head of the queue waits; facts: the decision"
     QUEUED = "queued", "the process returns to the queue, with the cause"
     SET_ASIDE = "set_aside", "no known host may ever take the process, with the reason"

@@ -430,7 +430,8 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
         return
     status, pending = end.status, adoption.is_pending(process)
     process.owner = 0
-    process.ran_on = host.name if status.run_time > 0.0 else ""
+    has_run = status.run_time > 0.0 and status.known_exit is not None
+    process.ran_on = host.name if has_run else ""
     process.exit_code = None if end.gone else status.known_exit
     if pending:
         adoption.end_adoption(state, process)

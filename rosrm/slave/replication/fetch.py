@@ -11,10 +11,6 @@ from rosrm.model.values import Assignment
 from rosrm.ros.slave.replication import NotSent, NotStored, ReplicationEndpoint
 from rosrm.snapshots.format import Head, TransferPart
 
-#: Seconds for the discovery of a slave, or its answer; then the next host is asked. On a busy
-#: machine discovery takes more than 3 s. The next host may have only the snapshot of an earlier
-#: instance, which ran on in a partition, and from which the process must not continue.
-PATIENCE: Final = 10.0
 #: Seconds after which a process starts from the newest local snapshot, even if a fetch is running.
 LONGEST: Final = 60.0
 
@@ -27,26 +23,32 @@ class Fetch:
         hosts: that hold a replica, the newest first.
         endpoint: sends requests to their slaves.
         here: the newest snapshot on this host; None: there is none.
+        patience: seconds for the discovery of a slave, or its answer; then the next host is asked.
+            On a busy machine discovery takes more than 3 s. The next host may have only the
+            snapshot of an earlier instance, which ran on in a partition, and from which the
+            process must not continue.
         take: writes a part, and calls back with None, or with the reason why it was not stored.
         ended: called once, with a message for the user.
     """
 
     def __init__(
         self, assignment: Assignment, hosts: tuple[str, ...], endpoint: ReplicationEndpoint, *,
-        here: Head | None, take: Callable[[TransferPart, Callable[[NotStored | None], None]], None],
+        here: Head | None, patience: float,
+        take: Callable[[TransferPart, Callable[[NotStored | None], None]], None],
         ended: Callable[[str], None],
     ) -> None:  # fmt: skip
         self._assignment = assignment
         self._hosts = list(hosts)
         self._endpoint = endpoint
         self._here = here
+        self._patience = patience
         self._take = take
         self._ended = ended
         self._has_ended = self._waits = False
         self._failures: list[str] = []
         self._wanted = TransferPart(assignment.spec.name, 0, 0, 0, 0, 0, b"")
         now = clocks.boot_time()
-        self._deadline, self._host_by = now + LONGEST, now + PATIENCE
+        self._deadline, self._host_by = now + LONGEST, now + self._patience
 
     def cancel(self) -> None:
         """Ask for no further part; `ended` is not called."""
@@ -69,16 +71,16 @@ class Fetch:
             host = self._hosts[0]
             if self._endpoint.finds_source(host, self._wanted.process, now):
                 self._waits = True
-                self._endpoint.ask(host, self._wanted, now, PATIENCE, self._answered)
+                self._endpoint.ask(host, self._wanted, now, self._patience, self._answered)
             elif now >= self._host_by:
-                self._next_host(f"its slave was not found within {PATIENCE:g} s", now)
+                self._next_host(f"its slave was not found within {self._patience:g} s", now)
 
     def _answered(self, part: TransferPart | NotSent) -> None:
         if self._has_ended:
             return
         now = clocks.boot_time()
         if isinstance(part, NotSent) and part.is_stale:
-            self._waits, self._host_by = False, now + PATIENCE
+            self._waits, self._host_by = False, now + self._patience
         elif isinstance(part, NotSent):
             self._next_host(part.message, now)
         elif part.number < self._assignment.snapshots_from or not part.data:
@@ -110,7 +112,7 @@ class Fetch:
         self._failures.append(f"{self._hosts.pop(0)}: {why}" if self._hosts else why)
         self._wanted = TransferPart(self._assignment.spec.name, 0, 0, 0, 0, 0, b"")
         self._waits = False
-        self._host_by = now + PATIENCE
+        self._host_by = now + self._patience
         if last or not self._hosts:
             self._end("")
         else:

@@ -21,7 +21,6 @@ from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 from rosrm.ros.slave.replication import MOST, NotStored, ReplicationEndpoint
 from rosrm.shortage import SHORTAGE
-from rosrm.slave.replication import fetch as fetching
 from rosrm.slave.replication.fetch import Fetch
 from rosrm.slave.replication.store import SnapshotStore
 from rosrm.snapshots.format import Head, TransferPart
@@ -383,7 +382,7 @@ class ReplicationService:
             return True
         self._preparing[assignment.instance] = None
         self._is_used = True
-        self._search(assignment, done, clocks.boot_time() + fetching.PATIENCE)
+        self._search(assignment, done, clocks.boot_time() + self._settings.wait)
         return False
 
     def _search(
@@ -455,7 +454,7 @@ class ReplicationService:
 
         fetch = self._preparing[instance] = Fetch(
             assignment, tuple(name for name in hosts if name != self._host), self._endpoint,
-            here=found.head, take=self._take_fetched, ended=ended,
+            here=found.head, patience=self._settings.wait, take=self._take_fetched, ended=ended,
         )  # fmt: skip
         fetch.advance(clocks.boot_time())
 

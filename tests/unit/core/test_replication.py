@@ -15,6 +15,8 @@ from rosrm.model.orders import DropReplica, ReplicateSnapshot
 from rosrm.model.values import (
     HostLossPolicy,
     InstanceId,
+    InstanceState,
+    InstanceStatus,
     MigrationPolicy,
     ProcessSpec,
     Readiness,
@@ -554,6 +556,23 @@ def test_an_older_branch_in_reach_does_not_replace_the_newer_one_of_an_absent_ho
     assert "has not rejoined yet" in cluster["p"].reason
     cluster.reconnect(replica, seconds=1.0)
     assert assigned(cluster).snapshot_hosts == (replica, former)
+
+
+@pytest.mark.parametrize("state", [InstanceState.WITHDRAWN, InstanceState.FENCED])
+def test_a_host_that_lost_its_power_comes_after_a_newer_replica(state):
+    """Its own snapshot may be older than the one that it reported before."""
+    cluster = running(Asked())
+    host, keeper = where(cluster), others(cluster)[0]
+    number = cluster["p"].owner
+    keep(cluster, keeper, ("p", number, 4))
+    keep(cluster, host, ("p", number, 2))
+    instance = InstanceId("p", number)
+    cluster.report(host, InstanceStatus(instance, state, exit_code=-1, run_time=5.0))
+    cluster.wait(1.0)
+    assert assigned(cluster).instance.number > number
+    assert assigned(cluster).snapshot_hosts == (keeper, host)
+    said = cluster.recorded("assigned")[-1]
+    assert f"its newest snapshot is cycle 4 of instance {number}, which {keeper} reported" in said
 
 
 def test_a_start_asks_the_host_of_the_last_run_first_for_an_unreported_snapshot():

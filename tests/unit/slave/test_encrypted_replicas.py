@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rosrm.model.values import Assignment, InstanceId
-from rosrm.slave.replication import fetch, store
+from rosrm.slave.replication import store
 from rosrm.slave.replication.encryption import encrypted
 from rosrm.slave.replication.keys import KEY
 from rosrm.snapshots import reader
@@ -26,10 +26,11 @@ PLAIN = b"\x2a" * 64
 
 
 @pytest.fixture
-def net(tmp_path, caplog, monkeypatch):
+def net(tmp_path, caplog):
     caplog.set_level(logging.INFO)
-    monkeypatch.setattr(fetch, "PATIENCE", 0.05)
-    return Net(tmp_path, caplog)
+    net = Net(tmp_path, caplog)
+    net.wait = 0.05
+    return net
 
 
 def start(net: Net, host: str, *snapshot_hosts: str, number: int = 9, **fields) -> Assignment:
@@ -232,7 +233,7 @@ def test_a_replica_that_cannot_be_read_now_stays(net, monkeypatch, headers):
 @pytest.mark.parametrize("lacks", [0, 1])
 def test_a_replica_waits_for_the_end_of_a_lack(net, monkeypatch, lacks):
     """A start without the replica would lose the state: its own snapshots would be newer."""
-    monkeypatch.setattr(fetch, "PATIENCE", 10.0)
+    net.wait = 10.0
     replicate(net, "b")
     opened, right = [], os.open
 

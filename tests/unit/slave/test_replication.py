@@ -16,7 +16,6 @@ from rosrm import clocks
 from rosrm.config.settings import KeepSettings
 from rosrm.model.values import Assignment, InstanceId, MigrationPolicy, ProcessSpec
 from rosrm.ros.slave.replication import NotSent, NotStored
-from rosrm.slave.replication import fetch
 from rosrm.slave.replication.service import ReplicationService
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block, TransferPart
@@ -88,6 +87,7 @@ class Net:
         self.unanswered: list[Callable[[], None]] = []
         self.reports: dict[str, list] = {}
         self.now = clocks.boot_time()
+        self.wait = KeepSettings().wait
 
     def add(self, name: str, **settings) -> ReplicationService:
         self.reports[name] = []
@@ -98,7 +98,7 @@ class Net:
             return True
 
         self.slaves[name] = ReplicationService(
-            self.root / name, name, KeepSettings(**settings), wire,
+            self.root / name, name, KeepSettings(**{"wait": self.wait, **settings}), wire,
             post=self.posted.put, publish=publish,
         )  # fmt: skip
         return self.slaves[name]
@@ -430,7 +430,7 @@ def test_a_changed_key_makes_no_start_take_an_older_snapshot(net):
 
 
 def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
-    monkeypatch.setattr(fetch, "PATIENCE", 0.05)
+    net.wait = 0.05
     net.add_all("abc")
     net.write("b", 42)
     net.write("c", 41)
@@ -441,7 +441,7 @@ def test_the_next_host_is_asked_where_the_first_is_not_found(net, monkeypatch):
 
 def test_without_a_newer_snapshot_a_process_starts_from_the_local_one(net, monkeypatch):
     """The slave logs the reason."""
-    monkeypatch.setattr(fetch, "PATIENCE", 0.05)
+    net.wait = 0.05
     net.add_all("ab")
     prepare(net, "a", assignment("b"))
     assert net.log.messages == [

@@ -25,7 +25,7 @@ from rosrm.core.master.assignment.places import (
     reserve_places,
     why_no_place,
 )
-from rosrm.core.master.checkpoint.replication import awaits_states
+from rosrm.core.master.checkpoint.replication import awaits_states, described, newest_snapshot
 from rosrm.core.master.commands import Assign
 from rosrm.core.master.dependants import note_restart
 from rosrm.core.master.hosts import capabilities
@@ -422,15 +422,20 @@ def _take_place(
     state.note_decision(process, decision, "assigned", now)
     devices = [str(one) for one in state.instances[instance.number].devices]
     with_them = f" with {listed(devices)}" if devices else ""
+    assignment = state.assignment(instance, process.spec)
+    snapshot = newest_snapshot(state, assignment, now)
     state.record(
         now, EventKind.ASSIGNED,
-        f"{process.name} is assigned to {host.name}{with_them}",
+        f"{process.name} is assigned to {host.name}{with_them}{described(snapshot)}",
         process=process.name, host=host.name,
-        facts={"number": instance.number, "decision": process.decision, "devices": devices},
+        facts={
+            "number": instance.number, "decision": process.decision, "devices": devices,
+            **({"snapshot": snapshot} if snapshot else {}),
+        },
     )  # fmt: skip
     state.save(process)
     note_restart(state, process)
-    return state.assignment(instance, process.spec)
+    return assignment
 
 
 def assign_to_adopt(state: MasterState, process: Process, now: float) -> None:

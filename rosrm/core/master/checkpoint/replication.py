@@ -29,7 +29,7 @@ import math
 from collections.abc import Mapping
 from itertools import islice
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.master_state import MasterState
@@ -45,7 +45,7 @@ from rosrm.extensions.declared_fields import unshared
 from rosrm.extensions.plugin_calls import required
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.orders import DropReplica, ReplicateSnapshot
-from rosrm.model.values import InstanceId, SnapshotReport
+from rosrm.model.values import Assignment, InstanceId, SnapshotReport
 
 #: Seconds between two reviews of the same process.
 _LOOK_EVERY: Final = 1.0
@@ -102,6 +102,31 @@ def awaits_states(state: MasterState, process: Process, now: float) -> bool:
         and not _was_left_on(process, host)
         and _may_rejoin(state, state.hosts.by_name[host], now)
         for host, replica in known.replicas.of(name).items()
+    )
+
+
+def newest_snapshot(
+    state: MasterState, assignment: Assignment, now: float
+) -> Mapping[str, Any] | None:
+    """Return the newest reported snapshot from which an instance may continue; None: none."""
+    known = state.replication.replicas.of(assignment.instance.process)
+    hosts = [name for name in assignment.snapshot_hosts if name in known]
+    if not hosts:
+        return None
+    host = max(hosts, key=lambda name: known[name].age)
+    one = known[host]
+    return {
+        "host": host, "number": one.number, "sequence": one.sequence, "elapsed": now - one.since
+    }  # fmt: skip
+
+
+def described(snapshot: Mapping[str, Any] | None) -> str:
+    """Return the end of a sentence on the result of `newest_snapshot`; "": there is none."""
+    if snapshot is None:
+        return ""
+    return (
+        f"; its newest snapshot is cycle {snapshot['sequence']} of instance {snapshot['number']}, "
+        f"which {snapshot['host']} reported {snapshot['elapsed']:.1f} s ago"
     )
 
 

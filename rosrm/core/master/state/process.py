@@ -273,8 +273,9 @@ class Process:
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
             process runs.
         ended_on: name of the host of its last run; "": it has not ended, or never ran.
-        ran_on: name of the host on which its last instance ran until it ended; "": unknown. The
-            slave there may not have reported the newest snapshot yet. Not persisted.
+        ran_on: name of the host on which its last instance ran until it ended; "": unknown, or no
+            supervisor saw the end. The slave there may not have reported the newest snapshot yet.
+            After a loss of power it has an older one. Not persisted.
         decision: newest placement decision about it, with its kind.
         left_behind: instance that may still run on a lost host, while this process waits in the
             queue.
