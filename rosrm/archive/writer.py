@@ -27,7 +27,7 @@ from rosrm.archive.layout import (
     segment_at,
 )
 from rosrm.archive.retention import ArchiveLimits, excess, is_within
-from rosrm.model.rows import LogPart
+from rosrm.model.rows import LARGEST_LOG_PART, LogPart
 from rosrm.runtime import durable
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.supervisor import log_index
@@ -35,8 +35,6 @@ from rosrm.supervisor.log_index import Mark
 
 #: Bytes of a segment, or of its index, beyond which it is closed.
 SEGMENT_BYTES: Final = 4 << 20
-#: Most bytes of a part of a log, as a slave sends it.
-_LONGEST_APPEND: Final = 1 << 20
 #: Part of the bound that may be written until the bounds are applied.
 _EXCESS_PART: Final = 64
 #: Empty segments, which remember the positions of sources whose logs were removed.
@@ -237,7 +235,7 @@ class ArchiveWriter:
 
 def _first_zero(segment: Segment) -> int:
     """Return the offset of the first zero in the last append of an open segment; -1: none."""
-    begin = max(segment.begin, segment.end - _LONGEST_APPEND)
+    begin = max(segment.begin, segment.end - LARGEST_LOG_PART)
     with segment.path.open("rb") as file:
         file.seek(begin - segment.begin)
         zero = file.read().find(b"\0")

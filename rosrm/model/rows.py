@@ -206,6 +206,10 @@ class Listing:
     strangers: str = ""
 
 
+#: Most bytes of the content of a `LogPart`; an archive appends one at a time.
+LARGEST_LOG_PART: Final = 1 << 20
+
+
 @dataclass(frozen=True, slots=True)
 class LogPart:
     """A part of an instance's log.

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from rosrm import clocks
 from rosrm.errors import Refused
-from rosrm.model.rows import LogPart
+from rosrm.model.rows import LARGEST_LOG_PART, LogPart
 from rosrm.model.values import InstanceId
 from rosrm.ros.slave.services import LogQuery
 from rosrm.shortage import exists
@@ -18,8 +18,6 @@ from rosrm.supervisor import log_index, paths
 from rosrm.supervisor.client import log_path
 from rosrm.wording import reason_of
 
-#: Most bytes in one answer.
-_MOST: Final = 1 << 20
 #: Most marks in one answer; an answer with more marks is shortened.
 _MOST_MARKS: Final = 4096
 #: Bytes of a block in the search for line ends.
@@ -122,7 +120,7 @@ def _read(
         offset = _whole_line(found)
     with found.path.open("rb") as log:
         log.seek(offset - found.begin)
-        content = log.read(min(query.max_bytes or _MOST, _MOST))
+        content = log.read(min(query.max_bytes or LARGEST_LOG_PART, LARGEST_LOG_PART))
     marks, end = _marks(found, offset, offset + len(content), now=found.path == path, pid=pid)
     content = content[: end - offset]
     return LogPart(query.number, numbers, content, offset, end, ended and end >= last, marks)
