@@ -34,6 +34,7 @@ from typing import Any, Final
 
 from rosrm.extensions import guard
 from rosrm.extensions.guard import Crash
+from rosrm.runtime import durable
 from rosrm.runtime.private_files import make_private_directory, open_private
 from rosrm.wording import reason_of
 
@@ -147,18 +148,18 @@ class CrashNotes:
     # --- former processes -----------------------------------------------------------------
 
     def _former(self, directory: Path) -> tuple[Crash, ...]:
-        found = []
+        found, read = [], []
         for path in directory.glob(f"{_FILE}.*"):
             pid = path.suffix[1:]
             # In a container each run may have the same pid.
             if not pid.isdigit() or (int(pid) != os.getpid() and _runs(int(pid))):
                 continue
             with contextlib.suppress(OSError):
-                content = path.read_bytes()
-                path.unlink()
-                found += self._blamed(content)
-        if found:
-            self._write()
+                found += self._blamed(path.read_bytes())
+                read.append(path)
+        if not found or self._write():  # otherwise the next start reads the files again
+            for path in read:
+                path.unlink(missing_ok=True)
         return tuple(found)
 
     def _blamed(self, content: bytes) -> list[Crash]:
@@ -184,12 +185,14 @@ class CrashNotes:
         known["text"], known["weight"] = text, known["weight"] + (2 if how else 1)
         return Crash(whom, text)
 
-    def _write(self) -> None:
-        with contextlib.suppress(OSError):  # a full disk: only the memory of this crash is lost
+    def _write(self) -> bool:
+        """Store the weights; return False where the disk is full, which changes nothing."""
+        try:
             text = json.dumps(self._known).encode()
-            descriptor = open_private(str(self._weights), os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(text)
+            os.close(durable.replace_atomically(str(self._weights), text))
+        except OSError:
+            return False
+        return True
 
 
 def _key(whom: str, hook: str) -> str:

@@ -7,6 +7,7 @@ import signal
 import stat
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -65,7 +66,8 @@ def test_the_command_prints_metrics_or_replaces_a_file(cluster, tmp_path):
     assert "rosrm_up 1.0" in printed.splitlines()
     assert "rosrm_events_total" not in printed
 
-    file = tmp_path / "rosrm.prom"
+    file = tmp_path / "metrics" / "rosrm.prom"
+    file.parent.mkdir()
     process = command(cluster, "--textfile", str(file), "--every", "0.1s")
     try:
         wait_until(file.exists, "the file is written", START_PATIENCE)
@@ -73,10 +75,14 @@ def test_the_command_prints_metrics_or_replaces_a_file(cluster, tmp_path):
         wait_until(lambda: file.stat().st_ino != before, "the file is replaced")
         assert 'rosrm_events_total{kind="finished"}' in file.read_text()
         assert stat.S_IMODE(file.stat().st_mode) == 0o644
+        file.parent.rename(tmp_path / "former")  # takes no file for a moment, like a full disk
+        time.sleep(0.3)
+        file.parent.mkdir()
+        wait_until(file.exists, "the file is written again")
     finally:
         process.send_signal(signal.SIGINT)
         assert process.wait(PATIENCE) == 130
-    assert [one.name for one in tmp_path.iterdir()] == ["rosrm.prom"]
+    assert [one.name for one in file.parent.iterdir()] == ["rosrm.prom"]
 
 
 def test_a_slave_writes_the_metrics_of_its_host(cluster, collected):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -78,6 +79,22 @@ def test_a_plugin_of_another_version_is_tried_again(tmp_path: Path) -> None:
     notes.note_versions({"filter 'odd'": "odd 1.1"})
     assert not notes.reason("filter 'odd'", "mask")
     notes.close()
+
+
+def test_a_full_disk_forgets_no_plugin(tmp_path: Path) -> None:
+    """What was stored stays, and what an end shows is stored by the next start with room."""
+    for _ in range(2):
+        _run(tmp_path, "exit")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))  # no file takes a byte
+    try:
+        with kept_notes(tmp_path):
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    notes = CrashNotes(tmp_path)
+    notes.close()
+    assert "this process ended" in notes.reason("filter 'odd'", "mask")
 
 
 def test_a_kill_from_outside_is_no_proof(tmp_path: Path) -> None:

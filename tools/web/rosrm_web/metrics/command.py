@@ -16,6 +16,7 @@ import typer
 from rosrm import clocks
 from rosrm.cli import connection
 from rosrm.cli.options import Domain, seconds_of
+from rosrm.cli.output.plain import echo
 from rosrm.errors import ConfigError, NoMaster
 from rosrm.runtime import durable
 from rosrm.wording import reason_of
@@ -69,8 +70,18 @@ def metrics(
             )  # fmt: skip
 
         feed = EventFeed(ask, after, MOST_EVENTS)
+        trouble = ""
         while True:
-            _write(_look(client, feed, counted), textfile)
+            content = _look(client, feed, counted)
+            try:
+                _write(content, textfile)
+                trouble = ""
+            except ConfigError as error:
+                if not period:
+                    raise
+                if str(error) != trouble:
+                    echo(f"rosrm: {error}; the next attempt is in {period:g} s", err=True)
+                trouble = str(error)
             if not period:
                 return
             time.sleep(period)
