@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -39,6 +40,23 @@ def test_the_newest_complete_image_counts(parent):
     assert slots.newest(parent) == (first, REJOIN)
     slots.complete(second, REJOIN)
     assert slots.newest(parent) == (second, REJOIN)
+    assert not first.exists()
+
+
+def test_an_image_is_on_the_disk_before_the_earlier_one_is_removed(parent, monkeypatch):
+    first, second = image(parent), image(parent.parent / "other")
+    slots.complete(first, REJOIN)
+    second = second.rename(parent / "2")
+    is_there, forced = [], os.fsync
+
+    def fsync(file):
+        forced(file)
+        is_there.append((Path(f"/proc/self/fd/{file}").readlink().name, first.exists()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    slots.complete(second, REJOIN)
+    names = {"manifest.json", "rejoin.json.new", "2", parent.name}
+    assert names <= {name for name, is_first in is_there if is_first}
     assert not first.exists()
 
 

@@ -3,7 +3,7 @@
     images/periodic-NUMBER/1, 2, ...    one image each; the file `rejoin.json` makes it valid
 
 Only a node that has left the ROS graph is dumped this way, and it rejoins as a new participant. So
-its peers treat its messages as new, however often one image is used. Standard library only.
+its peers treat its messages as new, however often one image is used.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from rosrm.errors import CriuError
+from rosrm.runtime import durable
 from rosrm.shortage import exists, status
 
 _REJOIN: Final = "rejoin.json"
@@ -48,11 +49,13 @@ def new_slot(parent: Path) -> Path:
 
 
 def complete(slot: Path, rejoin: Rejoin) -> None:
-    """Make an image valid: from now on the process starts from it. Remove older images."""
-    new = slot / f"{_REJOIN}.new"
-    new.touch(mode=0o600)
-    new.write_text(json.dumps(asdict(rejoin)), encoding="utf-8")
-    new.replace(slot / _REJOIN)
+    """Make an image valid: from now on the process starts from it. Remove older images.
+
+    An older image may be the only one that a loss of power leaves until the new one is on the disk.
+    """
+    durable.sync(str(slot))
+    durable.replace_durably(str(slot / _REJOIN), json.dumps(asdict(rejoin)).encode())
+    durable.sync_directory(str(slot.parent))
     for other in _slots(slot.parent):
         if other != slot:
             shutil.rmtree(other, ignore_errors=True)
