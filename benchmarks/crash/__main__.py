@@ -46,7 +46,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> dict[str, Any]:
 def _states(
     recording: Recording, parts: Collection[str], arguments: argparse.Namespace
 ) -> Iterator[tuple[FileSystem, str, State]]:
-    """Yield the states of a share of the moments, each with the part that it is of.
+    """Yield the states of a share of the moments, and of the last one, each with its part.
 
     Each part has a disk of its own: no sync of another part forces anything to it.
     """
@@ -55,10 +55,11 @@ def _states(
     for kind in FileSystem:
         disks = {part: Disk(kind, recording.attributes, part) for part in sorted(parts)}
         for number, call in enumerate(calls, 1):
-            changed = [part for part, disk in disks.items() if disk.apply(call)]
-            for part in changed:
-                if draw.random() < arguments.share:
-                    for state in disks[part].states(draw, arguments.each):
+            changed = {part for part, disk in disks.items() if disk.apply(call)}
+            is_last = number == len(calls)
+            for part, disk in disks.items():
+                if is_last or (part in changed and draw.random() < arguments.share):
+                    for state in disk.states(draw, arguments.each):
                         yield kind, part, state
                         yield from ((kind, SNAPSHOTS, one) for one in _losses(state, disks, draw))
             if number % 200 == 0:

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.mark.timeout(600)
 def test_each_reader_continues_from_what_a_loss_of_power_has_left() -> None:
     """Keys, journal, supervisor and archive, on states of ext4 and XFS at drawn moments."""
-    words = ("--share", "0.03", "--each", "4")
+    words = ("--share", "0.02", "--each", "4")
     done = subprocess.run(
         [sys.executable, "-m", "benchmarks.crash", *words],
         cwd=ROOT, capture_output=True, text=True, check=False,

@@ -25,6 +25,7 @@ from rosrm.model.values import (
 from rosrm.snapshots import reader
 from rosrm.snapshots.format import Block
 from rosrm.snapshots.writer import SlotWriter
+from rosrm.supervisor import procfs
 from rosrm_msgs.msg import StateMark
 from tests.ros.clusters import CALM, STEADY, Cluster, host
 from tests.waiting import PATIENCE, wait_until
@@ -308,6 +309,28 @@ def test_a_process_of_a_lost_host_continues_on_the_host_of_the_replica(three):
     assert wait_for_count(three, "lost", before)[0][0] > before
     three.wait_for_log("lost", "continues from the snapshot of lost#")
     process.end()
+
+
+def test_after_a_loss_of_power_a_process_continues_from_the_newer_replica(three):
+    """The slots of its host are as its disk had them before; the process returns to this host."""
+    three.submit(counter("dark"))
+    source = three.wait("dark", "running").host
+    wait_for_count(three, "dark", 10)
+    slots = [snapshot_directory(three, source, "dark") / name for name in reader.SLOTS]
+    on_disk = {slot: slot.read_bytes() for slot in slots}
+    wait_for_copy(three, "dark", 100)
+    since = three.client.list().last_sequence
+    three.switch_off(source)
+    for slot, content in on_disk.items():
+        slot.write_bytes(content)
+    for name in ("instances.jsonl", "heard"):
+        path = three.directory / "hosts" / source / "supervisor" / name
+        path.write_bytes(path.read_bytes().replace(procfs.boot_id().encode(), b"0" * 36))
+    three.start_slave_again(source)
+    three.wait_for_event("assigned", "its newest snapshot is cycle", after=since, process="dark")
+    assert three.wait("dark", "running").host == source
+    assert wait_for_count(three, "dark", 100)[0][0] > 100
+    three.cancel("dark")
 
 
 def test_a_host_without_the_replica_fetches_the_snapshot(three):
