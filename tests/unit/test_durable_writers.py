@@ -23,6 +23,7 @@ from rosrm.config.first_name import keep_name
 from rosrm.core.master.state.journal_gap import JournalGap
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.keys import key_files
+from rosrm.master.journal_writer import JournalWriter
 from rosrm.master.runtime import MasterRuntime
 from rosrm.model.artifacts import Artifact
 from rosrm.model.values import InstanceId
@@ -127,7 +128,10 @@ def opened_replica(root: Path) -> None:
 
 def start_of_a_master(root: Path) -> None:
     master: Any = MasterRuntime.__new__(MasterRuntime)
-    master._journal = SqliteJournal(root / "journal.sqlite")
+    path = root / "journal.sqlite"
+    master._journal = SqliteJournal(path)
+    master._writer = JournalWriter(master._journal, path)
+    master._stay_in_contact = lambda: None
     master._config = SimpleNamespace(name="m", record=SimpleNamespace(directory=Path()), state=root)
     master._recorder, last = None, master._last_run()
     master._state = SimpleNamespace(epoch=1, journal_gap=JournalGap())
