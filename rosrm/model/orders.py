@@ -48,8 +48,13 @@ class RestartInstance:
     run: Run | None = None
 
 
-#: A slave's code of the refusal of an `AmendInstance` for an instance that it knows.
+#: Codes of the refusal of an `AmendInstance` or `SetLifecycleState`: the slave knows the instance,
+#: and cannot carry out the order; the instance has ended, which a report follows; or the slave does
+#: not know it.
 NOT_AMENDED: Final = "not_amended"
+NOT_REACHED: Final = "unable"
+ENDED: Final = "ended"
+UNKNOWN: Final = "unknown"
 
 
 @dataclass(frozen=True, slots=True)

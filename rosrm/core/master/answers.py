@@ -29,9 +29,9 @@ def order_answered(state: MasterState, event: happened.OrderAnswered, now: float
         case None:
             return
         case MigrationStep(process):
-            steps.note_answer(state, process, event)
+            steps.note_answer(state, process, event, now)
         case InstanceAmendment():
-            amendments.note_answer(state, purpose, event)
+            amendments.note_answer(state, purpose, event, now)
         case Replication(process):
             replication.note_answer(state, process, event)
         case CapabilityQuery():

@@ -109,6 +109,16 @@ def indices(state: MasterState) -> Iterator[str]:
     )
 
 
+def restarts(state: MasterState) -> Iterator[str]:
+    """Check that restarts which may be off are allowed again after a migration."""
+    for process in state.processes.values():
+        owner = state.owner_of(process)
+        if owner is None or not owner.restarts_off or owner.stopping:
+            continue
+        if process.name not in state.migrations and process.name not in state.unamended:
+            yield f"{owner.id} is not restarted, and no order to change that is due"
+
+
 def declared(state: MasterState) -> Iterator[str]:
     """Compare each index with the declarations in the specs that are in force."""
     live = {name: one for name, one in state.processes.items() if not one.phase.is_terminal}
@@ -207,7 +217,9 @@ def specs(state: MasterState) -> Iterator[str]:
     for migration in (*state.migrations.values(), *state.standbys.values()):
         destination = state.instances.get(migration.destination.number)
         wanted = migration.spec or state.processes[migration.process].spec
-        if destination is not None and not migration.committed and destination.spec != wanted:
+        if destination is None or destination.stray:  # its host returned after the loss
+            continue
+        if not migration.committed and destination.spec != wanted:
             yield f"{destination.id} is not of the version that it is to replace"
 
 
@@ -304,7 +316,7 @@ def _exists(state: MasterState, purpose: Purpose) -> bool:
 #: Every invariant.
 INVARIANTS: Final[tuple[Callable[[MasterState], Iterator[str]], ...]] = (
     places, indices, declared, arrays, gangs, instances, specs, reservations, applications, ledger,
-    orders,
+    orders, restarts,
 )  # fmt: skip
 
 

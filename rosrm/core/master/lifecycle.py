@@ -34,7 +34,7 @@ from rosrm.model.values import (
     ProcessSpec,
     RestartPolicy,
 )
-from rosrm.wording import standing
+from rosrm.wording import ending_of, first_line, standing
 
 #: Phase of a process by the state of its owning instance.
 _PHASE: Final = {
@@ -65,6 +65,8 @@ _LARGEST_STATUS: Final = 10_000
 _DOWN: Final = frozenset({InstanceState.STARTING, InstanceState.BACKOFF})
 #: Seconds after the first refusal of a process by a host, after which the host is asked again.
 FIRST_EXCLUSION: Final = 60.0
+#: Ends that no restart policy follows.
+_NO_RESTART: Final = frozenset({InstanceState.REFUSED, InstanceState.FENCED})
 _ALIVE: Final = frozenset({InstanceState.STARTING, InstanceState.RUNNING, InstanceState.READY})
 
 
@@ -409,7 +411,10 @@ def _end(
         or process.wanted is DesiredState.REQUEUE
         or status.state is InstanceState.WITHDRAWN  # the slave stopped it without an order
     )
-    return End(status, ordered=ordered and not completed, completed=completed)
+    return End(
+        status, ordered=ordered and not completed, completed=completed,
+        restarts_off=instance.restarts_off,
+    )  # fmt: skip
 
 
 def _note_end(state: MasterState, instance: Instance, end: End) -> Migration | None:
@@ -440,15 +445,10 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
         _finish(state, process, phase, host, now, reason)
     elif pending:
         _finish(state, process, ProcessPhase.FAILED, host, now, status.message)
-    elif end.gone:
-        _requeue(state, process, host, now, status.message)
-    elif end.ordered:
-        _requeue(state, process, host, now, f"its instance on {host.name} was stopped")
-    elif status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
-        _requeue(state, process, host, now, status.message)
-    elif status.state is InstanceState.REFUSED:
-        exclude(process, host, status, now)
-        _requeue(state, process, host, now, f"{host.name} cannot run it: {status.message}")
+    elif (returns := _why_it_returns(process, end, host)) is not None:
+        if not (end.gone or end.ordered) and status.state is InstanceState.REFUSED:
+            exclude(process, host, status, now)
+        _requeue(state, process, host, now, returns)
     elif status.succeeded:
         _finish(state, process, ProcessPhase.FINISHED, host, now, status.message)
     else:
@@ -461,6 +461,23 @@ def conclude(state: MasterState, process: Process, end: End, host: Host, now: fl
             _finish(state, process, ProcessPhase.FAILED, host, now, reason)
 
 
+def _why_it_returns(process: Process, end: End, host: Host) -> str | None:
+    """Return why a process returns to the queue after an end; None: the end itself decides."""
+    status, policy = end.status, process.spec.restart
+    if end.gone:
+        return status.message
+    if end.ordered:
+        return f"its instance on {host.name} was stopped"
+    if status.state is InstanceState.FENCED and process.spec.host_loss.then != "stop":
+        return status.message
+    if status.state is InstanceState.REFUSED:
+        return f"{host.name} cannot run it: {status.message}"
+    if end.restarts_off and restarts_after(policy, status):
+        how = first_line(status.message) or ending_of(status.known_exit or 0)
+        return f"restart by policy {policy.when!r}: {how}"
+    return None
+
+
 def cancelled_as(process: Process) -> tuple[ProcessPhase, str]:
     """Return the terminal phase of a process that is being cancelled, and the reason."""
     if process.overdue:
@@ -471,7 +488,7 @@ def cancelled_as(process: Process) -> tuple[ProcessPhase, str]:
 
 def restarts_after(policy: RestartPolicy, status: InstanceStatus) -> bool:
     """Return True if the restart policy would have restarted an instance with this end."""
-    if status.state is InstanceState.REFUSED or policy.when == "never":
+    if status.state in _NO_RESTART or policy.when == "never":
         return False
     if policy.when == "always" or status.state is InstanceState.FAILED:
         return True  # an unhealthy instance has failed, even if it exits with 0

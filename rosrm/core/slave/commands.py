@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from rosrm.core.slave.watches import ManagedLifecycle, Memo, Transition
-from rosrm.model.orders import NOT_AMENDED
+from rosrm.model.orders import NOT_AMENDED, NOT_REACHED
 from rosrm.model.values import (
     Amendment,
     Assignment,
@@ -99,7 +99,7 @@ class Settle:
     """Answer the order to change an instance.
 
     Attributes:
-        refusal: why nothing has changed; "": it has, or the instance has ended.
+        refusal: why nothing has changed, for example because the instance has ended; "": it has.
         code: of the refusal.
     """
 
@@ -149,7 +149,7 @@ class SettleLifecycle:
     instance: InstanceId
     goal: LifecycleGoal
     refusal: str = ""
-    code: str = "unable"
+    code: str = NOT_REACHED
 
 
 @dataclass(frozen=True, slots=True)

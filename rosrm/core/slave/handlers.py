@@ -15,6 +15,7 @@ from rosrm.core.slave.steps import Step
 from rosrm.core.slave.watches import FIRST_RUN, Awaited, Memo
 from rosrm.model.adoption import NO_ADOPTION
 from rosrm.model.devices import title_of
+from rosrm.model.orders import ENDED, UNKNOWN
 from rosrm.model.values import (
     Assignment,
     InstanceId,
@@ -254,11 +255,9 @@ def _amendment_ordered(state: SlaveState, event: events.AmendmentOrdered, now: f
     held = state.held.get(instance)
     if held is None:
         return [_unknown(event)]
-    settled: _Commands = [
-        commands.Report((held.status,)), commands.Settle(instance, amendment)
-    ]  # fmt: skip
+    report = commands.Report((held.status,))
     if held.status.state.ended:
-        return settled
+        return [report, _ended(event)]
     held.amended = amendment.after(held.amended)
     news = _pause_or_watch(held, amendment.restart)
     waiting = state.waiting.get(instance)
@@ -266,7 +265,7 @@ def _amendment_ordered(state: SlaveState, event: events.AmendmentOrdered, now: f
         limits = waiting.spec.limits if amendment.limits is None else amendment.limits
         spec = replace(waiting.spec, restart=amendment.restart, limits=limits)
         state.waiting[instance] = replace(waiting, spec=spec, shadow=False)
-        return settled
+        return [report, commands.Settle(instance, amendment)]
     held.unsettled += (amendment,)
     remember = [commands.Remember(instance, held.memo)] if news else []
     return [commands.Amend(instance, amendment), *remember]
@@ -289,7 +288,12 @@ def _pause_or_watch(held: HeldInstance, restart: RestartPolicy) -> bool:
 
 def _unknown(order: events.AmendmentOrdered) -> commands.Settle:
     never = f"{order.instance} is not known here: it never ran on this host, or ended long ago"
-    return commands.Settle(order.instance, order.amendment, never, "unknown")
+    return commands.Settle(order.instance, order.amendment, never, UNKNOWN)
+
+
+def _ended(order: events.AmendmentOrdered) -> commands.Settle:
+    """Return the answer to an order that has no effect any more."""
+    return commands.Settle(order.instance, order.amendment, f"{order.instance} has ended", ENDED)
 
 
 def _amendment_recorded(
@@ -299,6 +303,9 @@ def _amendment_recorded(
     held = state.held.get(event.instance)
     if held is None:
         return [settled]
+    if held.status.state.ended and not event.refusal:
+        # The status of an end before the change precedes this event.
+        settled = _ended(events.AmendmentOrdered(event.instance, event.amendment))
     if event.amendment in held.unsettled:
         at = held.unsettled.index(event.amendment)
         held.unsettled = held.unsettled[:at] + held.unsettled[at + 1 :]
@@ -357,7 +364,7 @@ def _amend_again(
 ) -> commands.Command:
     """Return the command that repeats an order, because the former supervisor may have lost it."""
     if held.status.state.ended:
-        return commands.Settle(order.instance, order.amendment)
+        return _ended(order)
     return _unknown(order) if lost else commands.Amend(order.instance, order.amendment)
 
 
@@ -538,13 +545,13 @@ def _time_passed(state: SlaveState, event: events.TimePassed, now: float) -> _Co
         elif held.steering is not None:
             orders += _after(state, held, lifecycle_nodes.time_passed(held, now), now)
         elif held.ordered is not None and held.status.state.ended:
-            orders += lifecycle_nodes.settled(held, "it has ended")
+            orders += lifecycle_nodes.settled(held, "it has ended", ENDED)
         elif held.status.state.ended and _may_be_discarded(state, held, now):
             forgotten.append(instance)
     if forgotten:
         for instance in forgotten:
             held = state.drop(instance)
-            orders += [commands.Settle(instance, restart) for restart in held.unsettled]
+            orders += [_ended(events.AmendmentOrdered(instance, one)) for one in held.unsettled]
         orders.append(commands.Forget(tuple(forgotten)))
     return orders
 

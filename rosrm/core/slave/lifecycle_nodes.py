@@ -17,6 +17,7 @@ from rosrm.core.slave.health import resolve
 from rosrm.core.slave.state import HeldInstance, Steering
 from rosrm.core.slave.steps import NOTHING, Step
 from rosrm.core.slave.watches import ManagedLifecycle, Transition
+from rosrm.model.orders import ENDED, NOT_REACHED, UNKNOWN
 from rosrm.model.values import Assignment, InstanceState, LifecycleGoal
 
 #: Seconds between two requests for the state of a node.
@@ -65,8 +66,14 @@ def ordered(
     Args:
         waits: the instance waits for its start, and the supervisor does not know it.
     """
-    if held is None or held.lifecycle is None or held.status.state.ended:
-        why = "its host does not change the lifecycle state of its node, or it has ended"
+    if held is None:
+        why = f"{event.instance} is not known here"
+        return [commands.SettleLifecycle(event.instance, event.goal, why, UNKNOWN)]
+    if held.status.state.ended:
+        ended = commands.SettleLifecycle(event.instance, event.goal, "it has ended", ENDED)
+        return [commands.Report((held.status,)), ended]
+    if held.lifecycle is None:
+        why = "its host does not change the lifecycle state of its node"
         return [commands.SettleLifecycle(event.instance, event.goal, why)]
     answers = settled(held, "another state was ordered") if held.ordered != event.goal else []
     held.ordered = event.goal
@@ -80,10 +87,14 @@ def ordered(
     return answers
 
 
-def settled(held: HeldInstance, refusal: str = "") -> list[commands.Command]:
+def settled(
+    held: HeldInstance, refusal: str = "", code: str = NOT_REACHED
+) -> list[commands.Command]:
     """Answer the order of the master, if there is one."""
     goal, held.ordered = held.ordered, None
-    return [] if goal is None else [commands.SettleLifecycle(held.status.instance, goal, refusal)]
+    if goal is None:
+        return []
+    return [commands.SettleLifecycle(held.status.instance, goal, refusal, code)]
 
 
 def begin(held: HeldInstance, lifecycle: ManagedLifecycle, now: float) -> Step:

@@ -16,8 +16,8 @@ FenceOrdered            kills the instance; an unknown instance will never be st
 ContactConfirmed        sends the last contact to the supervisor, if a live instance has a fence
 RestartOrdered          stops the instance, and starts it again on this host
 AmendmentOrdered        orders the supervisor to change the instance; answers at once for one that
-                        waits, has ended or is unknown
-AmendmentRecorded       answers the order
+                        waits; refuses the order for one that has ended or is unknown
+AmendmentRecorded       answers the order; refuses it if the instance had ended before
 ReportRequested         reports all instances
 SupervisorReported      updates the statuses; a new run must become ready again
 SupervisorReplaced      the same; drops the instances that the new supervisor does not know,

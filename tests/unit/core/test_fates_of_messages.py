@@ -60,7 +60,8 @@ class Scenario:
         cluster.wait(1.0)
         self.before(cluster)
         cluster.wait(5.0)
-        cluster.disturb(fault)
+        number, fate = fault or (-1, "lost")
+        cluster.disturb(lambda sent, _: fate if sent == number else "")
         self.act(cluster)
         cluster.wait(self.seconds)
         return cluster

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from rosrm.core.master import events as happened
-from rosrm.core.master.commands import PublishStateConfig
+from rosrm.core.master.commands import PublishStateConfig, SendOrder
 from rosrm.core.master.lifecycle import restarts_after
-from rosrm.model.orders import StopInstance
+from rosrm.model.orders import AmendInstance, StopInstance
 from rosrm.model.plan import HandoffPhase, ReportPhase
 from rosrm.model.values import (
     InstanceId,
@@ -394,6 +394,41 @@ def test_a_source_that_ends_before_the_switch_follows_its_restart_policy(
     assert (cluster.phase("p"), len(cluster.active())) == ("running", 1)
     (message,) = cluster.recorded("queued")
     assert message == "p returns to the queue: restart by policy 'on-failure': exit code 3"
+
+
+class Crashing(Machine):
+    """A host on which a program ends before an order to change it; later statuses are lost."""
+
+    lost = False
+
+    def obey(self, sent: SendOrder, now: float) -> happened.OrderAnswered:
+        if isinstance(sent.order, AmendInstance) and sent.order.instance in self.programs:
+            self.lost = True
+            self.finish("p", now, code=3)
+        return super().obey(sent, now)
+
+    def say(self, batch: happened.StatusesReceived) -> None:
+        if not self.lost:
+            super().say(batch)
+
+
+@pytest.mark.parametrize("killed", [False, True], ids=["same master", "next master"])
+def test_a_destination_that_ends_before_its_restarts_are_allowed_is_started_again(
+    killed: bool,
+) -> None:
+    """The master learns the end late, and the slave has not applied the policy."""
+    cluster = Cluster("a")
+    cluster.submit(stateful())
+    crashing = Crashing("b", busy={"memory": 0.5, "cpu": 0.1})
+    cluster.add(crashing)
+    cluster.migrate("p", "b")
+    cluster.wait(3.0)
+    assert (cluster.active("p"), cluster["p"].owner) == ([], 2)
+    crashing.lost = False
+    if killed:
+        cluster.restart_master()
+    cluster.wait(15.0)
+    assert (cluster.phase("p"), len(cluster.active())) == ("running", 1)
 
 
 @pytest.mark.parametrize(("when", "again"), [("never", False), ("on-failure", True)])

@@ -17,6 +17,7 @@ from rosrm.model.values import (
     InstanceState,
     IsolationPolicy,
     Kind,
+    Limits,
     MigrationPolicy,
     ProcessSpec,
     RestartPolicy,
@@ -362,6 +363,29 @@ def test_a_readopted_process_has_its_restart_policy_again() -> None:
     assert (cluster.phase("p"), cluster.where("p")) == ("running", ["a"])
     amended = [one.amendment.restart for one in cluster.orders(AmendInstance)]
     assert amended == [RestartPolicy("on-failure")]
+
+
+@pytest.mark.parametrize("ends", [False, True], ids=["runs on", "ends"])
+def test_a_readopted_process_whose_restarts_a_move_turned_off_is_restarted(ends: bool) -> None:
+    """The order to allow them has no limits, which the slave refuses; or it comes too late."""
+    cluster = on_a(
+        process("p", restart=RestartPolicy("on-failure"), host_loss=ELSEWHERE,
+                migration=MigrationPolicy("handoff"), limits=Limits(memory=1e9)),
+    )  # fmt: skip
+    a = cluster.machines["a"]
+    a.uses = 2e9
+    cluster.add(Machine("b"))
+    a.quirks["p"].add("never silent")
+    cluster.migrate("p", "b")
+    assert cluster.state.instances[1].restarts_off
+    cluster.add(Machine("c", busy={"memory": 0.9}))
+    cluster.cut("a", "b", seconds=60.0)
+    assert cluster.phase("p") == "queued"
+    if ends:
+        a.finish("p", cluster.now, code=3)
+    cluster.reconnect("a", seconds=2.0)
+    assert (cluster.phase("p"), cluster["p"].owner) == ("running", 4 if ends else 1)
+    assert a.programs[a.find("p")].restart == RestartPolicy("on-failure")
 
 
 def test_a_process_that_was_cancelled_while_its_host_was_lost_is_not_readopted() -> None:

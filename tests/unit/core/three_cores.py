@@ -10,7 +10,7 @@ from __future__ import annotations
 import heapq
 import signal
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
@@ -18,6 +18,7 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 
 from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, SendOrder
+from rosrm.core.master.state.process import Instance as MasterInstance
 from rosrm.core.slave import commands, events
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState
@@ -26,6 +27,7 @@ from rosrm.core.supervisor import commands as acts
 from rosrm.core.supervisor import events as told
 from rosrm.core.supervisor.instance import STARTING, UNKNOWN_EXIT, Instance
 from rosrm.core.supervisor.reducer import SupervisorState
+from rosrm.core.supervisor.rules import RestartRule
 from rosrm.model.orders import AmendInstance, SetLifecycleState, seconds_of
 from rosrm.model.values import (
     Assignment,
@@ -51,6 +53,8 @@ Fate = Literal[
     "master killed after", "host cut", "busy hosts cut",
 ]  # fmt: skip
 FATES: Final[tuple[Fate, ...]] = get_args(Fate)
+#: Fate of a message by its number and description; "": it arrives.
+FateOf = Callable[[int, str], Fate | Literal[""]]
 
 #: Seconds of a message between master and slave, also of a late one, and within a host.
 LATENCY: Final = 0.02
@@ -62,6 +66,10 @@ LONG_CUT: Final = 14.0
 SLAVE_DOWN, SUPERVISOR_DOWN, MASTER_DOWN = 0.7, 0.3, 0.5
 #: Seconds after which the master gives up an answer, beyond those that the order may take.
 ORDER_TIMEOUT: Final = 3.0
+
+
+def _arrives(_number: int, _message: str) -> Literal[""]:
+    return ""
 
 
 class Launch(NamedTuple):
@@ -350,13 +358,14 @@ class ThreeCores(Cluster):
     """A master's core, and hosts with the cores of slave and supervisor.
 
     Attributes:
-        fault: number of one message (an index of `sent_messages`), and its fate.
+        fate_of: returns the fate of a message by its number (an index of `sent_messages`), and its
+            description.
         sent_messages: descriptions of all messages since `disturb`.
         finished: names of the jobs that have ended with exit code 0.
     """
 
     def __init__(self, hosts: str) -> None:
-        self.fault: tuple[int, Fate] | None = None
+        self.fate_of: FateOf = _arrives
         self.sent_messages: list[str] = []
         self.finished: set[str] = set()
         self._agenda: list[tuple[float, int, Callable[[], object]]] = []
@@ -397,8 +406,7 @@ class ThreeCores(Cluster):
             if host.connected and runs == (self.state.epoch, host.slave_run):
                 deliver()
 
-        number, fate = self.fault or (-1, "")
-        fate = fate if number == len(self.sent_messages) else ""
+        fate = self.fate_of(len(self.sent_messages), message)
         self.sent_messages.append(f"{message} ({host.name})")
         if fate not in ("lost", "late"):
             self.after(LATENCY, arrive)
@@ -415,10 +423,10 @@ class ThreeCores(Cluster):
         if fate in faults:
             self.after(*faults[fate])
 
-    def disturb(self, fault: tuple[int, Fate] | None) -> None:
-        """Count the messages from now on, one of which meets its fate."""
+    def disturb(self, fate_of: FateOf = _arrives) -> None:
+        """Count the messages from now on, which meet their fates."""
         self.sent_messages.clear()
-        self.fault = fault
+        self.fate_of = fate_of
 
     def _cut_off_busy_hosts(self) -> None:
         self._cut_off([host for host in self.hosts if host.programs], LONG_CUT)
@@ -478,6 +486,15 @@ class ThreeCores(Cluster):
                 active = [one for one in own if one.node.active]
             assert len(active) <= 1, f"{name} has {len(active)} active nodes"
 
+    def _policies(self) -> Iterator[tuple[MasterInstance, RestartRule]]:
+        """Return the owner of each process with the policy that its supervisor applies."""
+        for process in self.state.processes.values():
+            owner = self.state.owner_of(process)
+            host: Any = None if owner is None else self.machines[owner.host.name]
+            known = None if owner is None else host.supervisor.instances.get(key_of(owner.id))
+            if owner is not None and known is not None:
+                yield owner, known.restart
+
     def outcome(self) -> dict[str, tuple[str, int]]:
         """Return phase and number of instances of each process."""
         return {name: (self.phase(name), len(self.where(name))) for name in self.state.processes}
@@ -505,5 +522,9 @@ class ThreeCores(Cluster):
                 if one.unsettled or one.steering or one.loading or one.ordered
             ],
             "versions": versions if len(versions) > 1 else (),
+            "restart policies": [
+                f"{one.id}: {policy.when}" for one, policy in self._policies()
+                if policy != restart_rule(one.spec.restart)
+            ],
         }  # fmt: skip
         return [f"{what}: {found}" for what, found in tables.items() if found]

@@ -39,6 +39,7 @@ from rosrm.core.slave.handlers import REMEMBER_END, REPORT_WAIT
 from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.core.slave.watches import Memo, Observation
+from rosrm.model.orders import ENDED
 from rosrm.model.values import (
     Amendment,
     Fence,
@@ -403,14 +404,16 @@ def test_an_older_amendment_that_is_recorded_does_not_settle_a_newer_one(running
 
 
 def test_an_amendment_of_an_ended_instance_reports_its_end(running) -> None:
-    """The master receives the end, so its plan continues; the same holds for an end in between."""
+    """The order is refused, because it has no effect; the same holds for an end in between."""
+    refused = Settle(ONE, NEVER, "p#1 has ended", ENDED)
     running.step(AmendmentOrdered(ONE, NEVER))
     running.status(STATE.FAILED)
     report, settled = running.step(AmendmentOrdered(ONE, NEVER))
     assert states([report]) == [STATE.FAILED]
-    assert settled == Settle(ONE, NEVER)
+    assert settled == refused
     ended = replaced(InstanceStatus(ONE, STATE.FAILED))
-    assert Settle(ONE, NEVER) in running.step(ended)
+    assert refused in running.step(ended)
+    assert running.step(AmendmentRecorded(ONE, NEVER))[-1] == refused
 
 
 def test_an_amendment_of_an_unknown_instance_is_refused(running) -> None:
@@ -469,7 +472,8 @@ def test_an_amendment_of_a_forgotten_instance_is_settled(running) -> None:
     running.step(Registered(1))
     running.step(AmendmentOrdered(ONE, NEVER))
     running.status(STATE.EXITED)
-    assert Settle(ONE, NEVER) in running.step(TimePassed(), after=100.0)
+    refused = Settle(ONE, NEVER, "p#1 has ended", ENDED)
+    assert refused in running.step(TimePassed(), after=100.0)
 
 
 # --- limits -----------------------------------------------------------------------------------

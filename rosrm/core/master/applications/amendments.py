@@ -6,10 +6,11 @@ from typing import Final
 
 from rosrm.core.master.events import OrderAnswered
 from rosrm.core.master.master_state import MasterState
+from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.pending_orders import InstanceAmendment
 from rosrm.core.master.state.process import Instance, PendingAmendment
-from rosrm.model.orders import NOT_AMENDED, AmendInstance
+from rosrm.model.orders import ENDED, NOT_AMENDED, UNKNOWN, AmendInstance
 from rosrm.model.values import Amendment, ProcessSpec
 
 #: First and longest time, in seconds, until an order without effect is repeated.
@@ -25,7 +26,7 @@ def review(state: MasterState, now: float) -> None:
             del state.unamended[name]  # its next instance starts with the new spec
         elif name not in state.migrations and _is_due(state, owner, pending, now):
             pending.backoff.note(now, *_WAITS)
-            order = AmendInstance(owner.id, _amendment(process.spec, pending))
+            order = AmendInstance(owner.id, _amendment(process.spec, owner, pending))
             state.send(owner.host, order, InstanceAmendment(owner.id, order.amendment))
 
 
@@ -34,18 +35,28 @@ def _is_due(state: MasterState, owner: Instance, pending: PendingAmendment, now:
     return is_up and now >= pending.backoff.until
 
 
-def note_answer(state: MasterState, change: InstanceAmendment, event: OrderAnswered) -> None:
+def note_answer(
+    state: MasterState, change: InstanceAmendment, event: OrderAnswered, now: float
+) -> None:
     """Note that a slave has changed an instance, or why it has not."""
-    process = state.processes.get(change.instance.process)
-    if process is None or process.owner != change.instance.number:
+    process, owner = (
+        state.processes.get(change.instance.process), state.instances.get(change.instance.number)
+    )  # fmt: skip
+    if process is None or owner is None or process.owner != owner.id.number:
         return
+    if event.code in (ENDED, UNKNOWN):
+        state.ask_for_report(owner.host, now)  # the status of its end is missing
     pending = state.unamended.get(process.name)
-    if pending is None or _amendment(process.spec, pending) != change.amendment:
+    if pending is None or _amendment(process.spec, owner, pending) != change.amendment:
         return
     application = state.applications.get(process.spec.application)
     task = application.tasks.get(process.name) if application is not None else None
     if event.accepted:
-        del state.unamended[process.name]
+        owner.restarts_off = False
+        if pending.limits and change.amendment.limits is None:
+            pending.backoff = Backoff()
+        else:
+            del state.unamended[process.name]
         state.save(process)
     elif event.code == NOT_AMENDED:
         pending.refusal = f"its slave refuses: {event.message}"
@@ -53,6 +64,10 @@ def note_answer(state: MasterState, change: InstanceAmendment, event: OrderAnswe
             task.fault = pending.refusal
 
 
-def _amendment(spec: ProcessSpec, pending: PendingAmendment) -> Amendment:
-    """Return the change; a supervisor of an earlier version refuses one with limits."""
-    return Amendment(spec.restart, spec.limits if pending.limits else None)
+def _amendment(spec: ProcessSpec, owner: Instance, pending: PendingAmendment) -> Amendment:
+    """Return the change.
+
+    A slave that refuses the limits changes nothing. So restarts that are off are allowed first.
+    """
+    limits = pending.limits and not owner.restarts_off
+    return Amendment(spec.restart, spec.limits if limits else None)

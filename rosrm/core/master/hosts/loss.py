@@ -123,7 +123,7 @@ def _may_be_active(state: MasterState, instance: Instance) -> bool:
     migration = state.migrations.get(instance.id.process)
     if migration is None or migration.committed or migration.destination != instance.id:
         return False
-    may_run = instance.id.number in migration.launched - migration.suspended
+    may_run = instance.id.number in migration.launched and not instance.restarts_off
     alone = may_run and migration.plan.overlap == 0.0
     return alone or handoff.was_switched(migration)
 
@@ -137,8 +137,9 @@ def _give_up(state: MasterState, instance: Instance, now: float) -> None:
     )  # fmt: skip
     if process is not None and _may_be_readopted(process, instance):
         process.left_behind = LeftBehind(
-            instance.id.number, host.name, instance.node_name, process.began, instance.spec
-        )
+            instance.id.number, host.name, instance.node_name, process.began, instance.spec,
+            instance.restarts_off,
+        )  # fmt: skip
         process.ran_before = process.ran_before_owner(instance)
     requeue = instance.spec.host_loss.then != "stop"
     lifecycle.gone(state, instance, now, why, requeue=requeue)

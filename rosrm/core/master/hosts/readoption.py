@@ -57,6 +57,7 @@ def _readopt(
     # Unlike a new assignment, the instance has a state. So it is dropped if the host does not
     # report it.
     instance.node_name, instance.state = left.node_name, InstanceState.RUNNING
+    instance.restarts_off = left.restarts_off
     process.owner, process.left_behind = left.number, None
     process.began = left.began
     state.set_phase(process, ProcessPhase.STARTING, now)
@@ -64,8 +65,7 @@ def _readopt(
         now, EventKind.READOPTED, f"{host.name} reports again: {instance.id} still runs there",
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
-    # A migration at the time of the loss may have ordered the slave not to restart the instance,
-    # and its application may have changed since.
+    # Its application may have changed since, and the slave may not restart it (`restarts_off`).
     state.unamended[process.name] = PendingAmendment()
     state.save(process)
 

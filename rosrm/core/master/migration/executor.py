@@ -36,7 +36,12 @@ from rosrm.core.master.migration.steps import begin, outcome_of, title
 from rosrm.core.master.outcomes import StepFailed, StepOutcome, StepProgress
 from rosrm.core.master.state.backoff import Backoff
 from rosrm.core.master.state.migration import End, Migration
-from rosrm.core.master.state.process import DesiredState, Process, ProcessPhase
+from rosrm.core.master.state.process import (
+    DesiredState,
+    PendingAmendment,
+    Process,
+    ProcessPhase,
+)
 from rosrm.core.master.state.spec_changes import with_in_place
 from rosrm.model.event_kinds import EventKind
 from rosrm.model.plan import (
@@ -379,19 +384,16 @@ def _settle_owner(state: MasterState, process: Process, migration: Migration, no
         return
     if process.wanted is not DesiredState.RUN and not owner.stopping:
         lifecycle.stop_owner(state, process, owner, now)
+    if owner.restarts_off:  # the plan was given up, or does not allow them again
+        state.unamended.setdefault(process.name, PendingAmendment(limits=False))
     lifecycle.note_phase(state, process, owner, now)
     state.save(process)
 
 
 def _end_of_owner(process: Process, migration: Migration) -> End:
-    """Return the end of the owner, corrected for orders of the migration (stop, no restarts)."""
+    """Return the end of the owner, corrected for an order of the migration to stop."""
     end = migration.ended[process.owner]
-    policy = process.spec.restart
     was_source = process.owner == migration.source.number
     if was_source and not end.completed and _was_ordered_to_stop(migration, migration.source):
         return replace(end, ordered=True)
-    if process.owner in migration.suspended and lifecycle.restarts_after(policy, end.status):
-        how = migration.how_ended(InstanceId(process.name, process.owner))
-        why = f"restart by policy {policy.when!r}: {how}"
-        return replace(end, gone=True, status=replace(end.status, message=why))
     return end

@@ -22,6 +22,8 @@ from rosrm.core.master.state.pending_orders import MigrationStep
 from rosrm.core.master.state.process import Instance
 from rosrm.model.lifecycle_rules import own_services
 from rosrm.model.orders import (
+    ENDED,
+    UNKNOWN,
     AmendInstance,
     Order,
     RunExecutor,
@@ -111,22 +113,29 @@ def outcome_of(state: MasterState, migration: Migration, step: Step, now: float)
     return outcome
 
 
-def note_answer(state: MasterState, process: str, event: OrderAnswered) -> None:
+def note_answer(state: MasterState, process: str, event: OrderAnswered, now: float) -> None:
     """Note the answer to an order of the current step of a migration.
 
     An answer counts even if the order was repeated since. Otherwise no step would complete on a
     link whose answers take longer than `order_retry`.
 
     The results of executors are arguments of later ones. The answer to the start of a standby is
-    ignored, because that order is repeated anyway.
+    ignored, because that order is repeated anyway. An instance that has ended ends a setting by its
+    report, which may be lost.
     """
     migration = state.migrations.get(process)
     if migration is None or event.order not in migration.orders:
         return
     if event.outcome is OrderOutcome.TIMEOUT:
         return
-    migration.answer = event
     step = migration.current_step
+    if isinstance(step, SetRestart | SetLifecycle) and event.code in (ENDED, UNKNOWN):
+        state.ask_for_report(state.hosts.by_name[step.host], now)
+        return
+    migration.answer = event
+    instance = state.instances.get(step.instance.number) if isinstance(step, SetRestart) else None
+    if event.accepted and isinstance(step, SetRestart) and instance is not None:
+        _set_restarts_off(state, migration, step, instance)
     if event.accepted and event.result and isinstance(step, Execute):
         migration.results[step.executor] = event.result
 
@@ -162,12 +171,20 @@ def _order_of(
     if isinstance(step, Execute):
         return RunExecutor(step.executor, _arguments(migration, step), step.timeout)
     if isinstance(step, SetRestart):
-        spec = migration.spec_of(step.instance, state.processes[migration.process].spec)
-        if step.restart != spec.restart:
-            migration.suspended.add(step.instance.number)
-            state.save_migration(migration)
+        instance = state.instances.get(step.instance.number)
+        if instance is not None and not instance.restarts_off:
+            _set_restarts_off(state, migration, step, instance)
         return AmendInstance(step.instance, Amendment(step.restart))
     return _start(state, migration, step, now)
+
+
+def _set_restarts_off(
+    state: MasterState, migration: Migration, step: SetRestart, instance: Instance
+) -> None:
+    """Note which restart policy an instance may have from now on."""
+    process = state.processes[migration.process]
+    instance.restarts_off = step.restart != migration.spec_of(step.instance, process.spec).restart
+    state.save(process)
 
 
 def _arguments(migration: Migration, step: Execute) -> Mapping[str, Any]:
@@ -178,8 +195,6 @@ def _start(state: MasterState, migration: Migration, step: Start, now: float) ->
     process = state.processes[migration.process]
     spec, number = migration.spec_of(step.instance, process.spec), step.instance.number
     migration.launched.add(number)
-    if step.shadow or step.restored:
-        migration.suspended.add(number)
     state.save_migration(migration)
     if number not in state.instances and number not in migration.ended:
         host, needs = state.hosts.by_name[step.host], state.estimate(spec)
@@ -187,9 +202,9 @@ def _start(state: MasterState, migration: Migration, step: Start, now: float) ->
         devices = migration.source_devices if host is migration.source_host else ()
         state.add_instance(step.instance, spec, host, now, needs, devices=devices)
         state.save(process)
-    instance = state.instances.get(number)
-    if instance is not None and instance.node_name != step.node_name:
-        instance.node_name = step.node_name
+    instance, facts = state.instances.get(number), (step.node_name, step.shadow or step.restored)
+    if instance is not None and (instance.node_name, instance.restarts_off) != facts:
+        instance.node_name, instance.restarts_off = facts
         state.save(process)
     remappings = {**spec.remappings, **step.remappings}
     if step.instance == migration.destination:

@@ -155,6 +155,8 @@ def _restore_instances(
     aliases, standby = item.get("node_names", {}), item.get("standby")
     given = item.get("devices", {})  # absent in older journals
     specs = item.get("specs", {})  # absent in older journals
+    # In older journals the migration has them.
+    off = item.get("restarts_off", [*_suspended(move), *_suspended(standby)])
     moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}
     for number, host_name in item["instances"].items():
@@ -168,6 +170,7 @@ def _restore_instances(
             needs = state.estimate(spec)
             held = state.add_instance(instance, spec, host, now, needs, devices=devices)
             held.node_name = str(aliases.get(number, ""))
+            held.restarts_off = instance.number in off
             held.settled = number == str(item["owner"]) and _has_run(state, process, now)
         else:
             adopt_to_stop(state, instance, spec, host, now)
@@ -179,6 +182,10 @@ def _restore_instances(
         state.instances[process.owner].restarting = PendingRestart(
             **known, ordered_at=-inf if at is None else at
         )
+
+
+def _suspended(move: Mapping[str, Any] | None) -> list[int]:
+    return [] if move is None else move.get("suspended", [])
 
 
 def _has_run(state: MasterState, process: Process, now: float) -> bool:

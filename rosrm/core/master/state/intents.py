@@ -90,6 +90,7 @@ def process_intent(tables: Tables, process: Process) -> Intent:
             "host": owner.host.name if owner else process.ended_on,
             "instances": {number: one.host.name for number, one in instances},
             "node_names": {number: one.node_name for number, one in instances if one.node_name},
+            "restarts_off": [one.id.number for _, one in instances if one.restarts_off],
             "devices": {number: to_plain(one.devices) for number, one in instances if one.devices},
             "specs": {
                 number: to_plain(one.spec) for number, one in instances

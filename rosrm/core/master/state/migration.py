@@ -26,12 +26,14 @@ class End:
         ordered: the instance was ordered to stop, so its exit code has no meaning.
         completed: a job ran to completion, even if an order to stop was on its way.
         gone: the instance is missing or lost, and its process may be queued again.
+        restarts_off: its slave may not have applied the restart policy of its spec.
     """
 
     status: InstanceStatus
     ordered: bool = False
     completed: bool = False
     gone: bool = False
+    restarts_off: bool = False
 
 
 @dataclass(slots=True)
@@ -68,9 +70,6 @@ class Migration:
         stuck: a step that must succeed failed; it is retried with a back-off.
         answer: the slave's answer to the order of the current step; None: no answer yet.
         launched: numbers of the instances that were ordered to start.
-        suspended: numbers of the instances that their slave was ordered not to restart. A later
-            order that allows restarts does not remove a number, because its answer may arrive
-            before the report of an end.
         ended: instance number to the end of that instance.
         handoff_reports: instance number to its reports on a handoff.
         taking_over: the destination was ordered to take over without its source.
@@ -111,7 +110,6 @@ class Migration:
     retry: Backoff = field(default_factory=Backoff)
     answer: OrderAnswered | None = None
     launched: set[int] = field(default_factory=set)
-    suspended: set[int] = field(default_factory=set)
     ended: dict[int, End] = field(default_factory=dict)
     handoff_reports: dict[int, HandoffReports] = field(default_factory=dict)
     taking_over: bool = False
@@ -217,10 +215,10 @@ def undo_steps(plan: Plan, turned_at: int) -> Sequence[Step]:
 #: Fields that are journaled unchanged: of a migration, of an end, and of the status of an end.
 JOURNALED: Final = (
     "strategy", "cause", "wall", "source_node", "destination_node", "index", "turned_at",
-    "committed", "failure", "launched", "suspended", "results", "aim",
+    "committed", "failure", "launched", "results", "aim",
     "source_devices",
 )  # fmt: skip
-_END: Final = ("ordered", "completed", "gone")
+_END: Final = ("ordered", "completed", "gone", "restarts_off")
 _STATUS: Final = ("state", "exit_code", "exit_signal", "message", "run_time")
 
 

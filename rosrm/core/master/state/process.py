@@ -126,6 +126,8 @@ class Instance:
         devices: devices of its host that it holds.
         stray: its host reports it, and the master has not assigned it to that host.
         began: its first start, as its host reports; inf: unknown.
+        restarts_off: its slave may not apply the restart policy of its spec: another one was
+            ordered, and no order to apply that of the spec has had an effect since.
     """
 
     id: InstanceId
@@ -155,6 +157,7 @@ class Instance:
     devices: tuple[HeldDevice, ...] = ()
     stray: bool = False
     began: float = inf
+    restarts_off: bool = False
 
     @property
     def is_running(self) -> bool:
@@ -194,6 +197,7 @@ class LeftBehind:
     Attributes:
         began: unix time at which the process first started since it left the queue; 0: it did not.
         spec: spec of the instance; None: that of its process, as in older journals.
+        restarts_off: as of the instance.
     """
 
     number: int
@@ -201,6 +205,7 @@ class LeftBehind:
     node_name: str = ""
     began: float = 0.0
     spec: ProcessSpec | None = None
+    restarts_off: bool = False
 
 
 @dataclass(frozen=True, slots=True)
