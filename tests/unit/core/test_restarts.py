@@ -8,7 +8,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.slave import events
 from rosrm.model.orders import ReportInstances, RestartInstance
 from rosrm.model.values import HostLossPolicy, InstanceState, InstanceStatus, RestartPolicy
-from tests.unit.core.cluster import Cluster, job, process
+from tests.unit.core.cluster import Cluster, job, movable, process
 from tests.unit.core.test_start_order import follower
 
 
@@ -105,6 +105,17 @@ def test_a_late_copy_of_a_restart_order_does_not_restart_the_next_run() -> None:
     cluster.machines["a"].ordered.append(sent)
     cluster.wait(10.0)
     assert cluster.runs("p") == 1
+
+
+def test_a_process_is_not_moved_until_its_restart_is_reported() -> None:
+    """The restart of a source that has become silent would make two active nodes."""
+    cluster = Cluster("a", "b").with_processes(movable("p"))
+    cluster.ask(happened.RestartRequested, ("p",), settle=False)
+    cluster.machines["a"].ordered.clear()
+    assert "p is being restarted" in cluster.migrate("p", "b").message
+    assert "p is being restarted" in cluster.checkpoint("p").message
+    cluster.wait(10.0)
+    assert cluster.migrate("p", "b").accepted
 
 
 @pytest.mark.parametrize("state", [InstanceState.EXITED, InstanceState.FAILED])

@@ -16,6 +16,7 @@ from rosrm.core.master.assignment.neighbours import neighbours_of
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.start import (
     begin_move,
+    is_being_restarted,
     may_begin,
     plan_move,
     why_busy,
@@ -78,6 +79,8 @@ def _migrate(
     others = process.instances - {source.id.number}
     if others and process.name not in state.standbys:
         return Busy(f"an earlier instance of {process.name} is still being stopped")
+    if is_being_restarted(state, process):
+        return Busy(f"{process.name} is being restarted")
     excluded = {**process.forbidden_hosts, **unable(state, process, source.host.name)}
     ranking = ranking_of(state, _demand(state, process, spec, excluded))
     column = source.host.column if ranking.fits(source.host.column) else ranking.best()

@@ -17,6 +17,7 @@ from rosrm.core.master.hosts import capabilities
 from rosrm.core.master.master_state import MasterState
 from rosrm.core.master.migration.blackout import changes_source
 from rosrm.core.master.migration.start import (
+    is_being_restarted,
     move_of,
     planned,
     why_busy,
@@ -68,6 +69,8 @@ def why_no_checkpoint(state: MasterState, process: Process) -> str:
     refusal = _why_not_dumped(state, process)
     if refusal:
         return refusal
+    if is_being_restarted(state, process):
+        return f"{process.name} is being restarted; it can be checkpointed afterwards"
     owner, name = state.instances[process.owner], _strategy_of(state, process)
     if not name:
         return _why_no_strategy(state, process)

@@ -135,6 +135,7 @@ def _may_be_dumped(state: MasterState, process: Process, owner: Instance) -> boo
         process.phase is ProcessPhase.RUNNING
         and owner.is_running
         and not owner.stopping
+        and owner.restarting is None
         and process.name not in state.migrations
         and state.hosts.condition_of(owner.host) is HostCondition.UP
     )

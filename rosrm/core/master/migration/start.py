@@ -140,11 +140,23 @@ def why_immovable(state: MasterState, process: Process) -> str:
     if process.phase is not ProcessPhase.RUNNING:
         stands = standing(process.phase.value)
         return f"{process.name} {stands}; only a running process can be moved"
+    if is_being_restarted(state, process):
+        return f"{process.name} is being restarted; it can be moved afterwards"
     standby = state.standbys.get(process.name)
     others = process.instances - {process.owner, standby.destination.number if standby else 0}
     if others:
         return f"an earlier instance of {process.name} is still being stopped"
     return why_never_movable(state, process)
+
+
+def is_being_restarted(state: MasterState, process: Process) -> bool:
+    """Return True if a restart was ordered that no status shows yet.
+
+    The slave may restart the program even if the plan of a migration turns its restarts off, and a
+    source that has become silent would publish again.
+    """
+    owner = state.owner_of(process)
+    return owner is not None and owner.restarting is not None
 
 
 def why_never_movable(state: MasterState, process: Process) -> str:
