@@ -55,6 +55,9 @@ NOT_AMENDED: Final = "not_amended"
 NOT_REACHED: Final = "unable"
 ENDED: Final = "ended"
 UNKNOWN: Final = "unknown"
+#: Code of the refusal of an order that is not for this run of the slave: nothing was done, and the
+#: master gives the order again if it is still needed.
+STALE: Final = "stale"
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ from rosrm.core.master.state.hosts import HostCondition
 from rosrm.core.master.state.pending_orders import Restart
 from rosrm.core.master.state.process import DesiredState, Instance, PendingRestart, Process
 from rosrm.model.event_kinds import EventKind
-from rosrm.model.orders import RestartInstance
+from rosrm.model.orders import STALE, RestartInstance
 from rosrm.model.values import InstanceState, InstanceStatus
 
 #: Reported ends other than those by a refusal, a fence or the stop of a slave.
@@ -103,10 +103,11 @@ def note_answer(
     if instance is None or process is None or instance.restarting is None:
         return
     backoff = instance.restarting.backoff
-    if event.outcome is OrderOutcome.TIMEOUT and backoff.tries == 1:
+    has_no_answer = event.outcome is OrderOutcome.TIMEOUT or event.code == STALE
+    if has_no_answer and backoff.tries == 1:
         backoff.until = now
         review(state, instance, now)
-    elif event.outcome is not OrderOutcome.TIMEOUT and not event.accepted:
+    elif not has_no_answer and not event.accepted:
         _give_up(state, process, instance, event.reason, now, again=False)
 
 

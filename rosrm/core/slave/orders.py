@@ -1,9 +1,20 @@
-"""Conversion of the master's orders to events of the slave's core."""
+"""Conversion of the master's orders to events of the slave's core, and orders that it refuses."""
 
 from __future__ import annotations
 
 from rosrm.core.slave import events
 from rosrm.model import orders
+
+
+def why_stale(order: orders.Order, *, registered: bool) -> str:
+    """Return why an order is not for this run of the slave; "" if it is.
+
+    The master may have sent the order before it learned the instances of this host. Only an end can
+    then do no harm.
+    """
+    if registered or isinstance(order, orders.StopInstance | orders.FenceInstance):
+        return ""
+    return "this slave is not registered with the master at present; nothing was done"
 
 
 def event_of(order: orders.InstanceOrder, given_at: float | None = None) -> events.Event:

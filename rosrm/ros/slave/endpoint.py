@@ -272,6 +272,11 @@ class SlaveEndpoint:
             self._take_registration,
         )  # fmt: skip
 
+    @property
+    def is_registered(self) -> bool:
+        """Return True if the master has registered this host."""
+        return self.link is MasterLink.REGISTERED
+
     def _take_registration(self, response: srv.RegisterHost.Response | None) -> None:
         now = clocks.boot_time()
         if response is None or response.answer.code == "stale":

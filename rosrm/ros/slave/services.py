@@ -10,11 +10,12 @@ from typing import Any, Literal, NamedTuple
 
 from rosrm import clocks
 from rosrm.core.slave.events import Event
-from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.orders import event_of, why_stale
 from rosrm.errors import Refused
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
 from rosrm.model.orders import (
+    STALE,
     AmendInstance,
     DropReplica,
     MeasureLinks,
@@ -129,6 +130,10 @@ class SlaveServices:
         """Carry out an order; some outcomes, such as those of executors, come later."""
         try:
             order = order_from_msg(request)
+            stale = why_stale(order, registered=self._endpoint.is_registered)
+            if stale:
+                respond(srv.ControlHost.Response(answer=refused(STALE, stale)))
+                return
             match order:
                 case StartInstance(assignment):
                     self._start(assignment, request)

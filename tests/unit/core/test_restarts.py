@@ -203,6 +203,18 @@ def test_a_refused_restart_is_recorded_and_not_repeated() -> None:
     assert cluster.runs("p") == 0
 
 
+def test_a_restart_is_ordered_again_if_the_order_was_for_a_former_run_of_the_slave() -> None:
+    """The slave was not registered when the order arrived, and did nothing."""
+    cluster = Cluster("a").with_processes(process("p"))
+    cluster.machines["a"].slave.registered = False
+    cluster.restart("p")
+    assert cluster.runs("p") == 0
+    cluster.machines["a"].slave.registered = True
+    cluster.wait(10.0)
+    assert cluster.runs("p") == 1
+    assert not cluster.recorded("restart_refused")
+
+
 def test_a_dependant_is_restarted_although_its_slave_forgets_the_accepted_order() -> None:
     """The restart stays due until a status shows it."""
     cluster = Cluster("a").with_processes(process("camera"), follower("p", "camera"))

@@ -20,7 +20,7 @@ from rosrm.core.master import events as happened
 from rosrm.core.master.commands import Assign, SendOrder
 from rosrm.core.master.state.process import Instance as MasterInstance
 from rosrm.core.slave import commands, events
-from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.orders import event_of, why_stale
 from rosrm.core.slave.state import SlaveState
 from rosrm.core.slave.watches import Memo
 from rosrm.core.supervisor import commands as acts
@@ -123,7 +123,8 @@ class TimedHost(Portable):
     def receive(self, sent: SendOrder, respond: Callable[[happened.OrderAnswered], None]) -> None:
         """Receive an order of the master, and answer once it is carried out."""
         order, now = sent.order, self.cluster.now
-        if not isinstance(order, AmendInstance | SetLifecycleState):
+        stale = why_stale(order, registered=self.slave.registered)
+        if stale or not isinstance(order, AmendInstance | SetLifecycleState):
             respond(self.obey(sent, now))
             return
 

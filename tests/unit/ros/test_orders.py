@@ -9,7 +9,7 @@ from typing import get_args
 import pytest
 
 from rosrm.core.slave import events as happened
-from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.orders import event_of, why_stale
 from rosrm.errors import Refused
 from rosrm.model.links import LinkPeer
 from rosrm.model.orders import (
@@ -66,6 +66,14 @@ ORDERS = [
 
 def test_every_order_is_tried_below():
     assert {type(order) for order in ORDERS} == set(get_args(Order))
+
+
+@pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
+def test_a_slave_that_is_not_registered_executes_only_orders_to_end_an_instance(order):
+    """It may not know its instances yet, and the master does not know this run of it."""
+    ends = isinstance(order, StopInstance | FenceInstance)
+    assert bool(why_stale(order, registered=False)) is not ends
+    assert not why_stale(order, registered=True)
 
 
 @pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)

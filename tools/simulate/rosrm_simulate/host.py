@@ -22,11 +22,12 @@ from rosrm.core.master.events import OrderAnswered, StatusesReceived, UsagesRece
 from rosrm.core.master.state.host_arrays import FloatArray
 from rosrm.core.slave import commands, events, reducer
 from rosrm.core.slave.lifecycle_nodes import STATE_AFTER
-from rosrm.core.slave.orders import event_of
+from rosrm.core.slave.orders import event_of, why_stale
 from rosrm.core.slave.state import SlaveState, under_limits
 from rosrm.errors import assert_never
 from rosrm.model.devices import Device
 from rosrm.model.orders import (
+    STALE,
     AmendInstance,
     DropReplica,
     MeasureLinks,
@@ -315,7 +316,10 @@ class Host(ABC, Generic[ProgramT]):
 
     def obey(self, sent: SendOrder, now: float) -> OrderAnswered:
         """Carry out an order, and return the answer."""
-        order, refusal, code = sent.order, "", "refused"
+        order, code = sent.order, "refused"
+        refusal = why_stale(order, registered=self.slave.registered)
+        if refusal:
+            return OrderAnswered(sent.order_id, False, STALE, refusal)
         match order:
             case RunExecutor():
                 return self.execute(sent.order_id, order)

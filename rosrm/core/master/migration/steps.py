@@ -23,6 +23,7 @@ from rosrm.core.master.state.process import Instance
 from rosrm.model.lifecycle_rules import own_services
 from rosrm.model.orders import (
     ENDED,
+    STALE,
     UNKNOWN,
     AmendInstance,
     Order,
@@ -126,9 +127,10 @@ def note_answer(state: MasterState, process: str, event: OrderAnswered, now: flo
     migration = state.migrations.get(process)
     if migration is None or event.order not in migration.orders:
         return
-    if event.outcome is OrderOutcome.TIMEOUT:
-        return
     step = migration.current_step
+    is_given_again = event.code == STALE and not isinstance(step, Execute)
+    if event.outcome is OrderOutcome.TIMEOUT or is_given_again:
+        return
     if isinstance(step, SetRestart | SetLifecycle) and event.code in (ENDED, UNKNOWN):
         state.ask_for_report(state.hosts.by_name[step.host], now)
         return
