@@ -514,7 +514,10 @@ class ImageLauncher(Protocol):
     """A launcher that starts an instance from its newest image after a crash."""
 
     def discard_images(self, instance: InstanceId) -> None:
-        """Discard the images of an instance, because a user restarts it without its old memory."""
+        """Discard the images of an instance, because a user restarts it without its old memory.
+
+        If this raises or is late, the restart is refused with the reason.
+        """
 
 
 @dataclass(frozen=True)

@@ -23,14 +23,16 @@ from rosrm.core.slave.events import (
     DevicesMissed,
     Event,
     Registered,
+    RestartOrdered,
     Slept,
     StartDelayed,
     TimePassed,
 )
+from rosrm.core.slave.handlers import restarts
 from rosrm.core.slave.health import LOOK_PERIOD
 from rosrm.core.slave.orders import event_of
 from rosrm.core.slave.state import SlaveState, under_limits
-from rosrm.errors import Refused
+from rosrm.errors import LaunchError, Refused
 from rosrm.extensions.contracts import LauncherContext, ProbeContext
 from rosrm.extensions.plugin_calls import TITLES, Plugin
 from rosrm.extensions.plugin_deadline import Deadlines
@@ -38,7 +40,13 @@ from rosrm.extensions.process_state import ProcessState
 from rosrm.extensions.registry import Registry
 from rosrm.keys.security import Member
 from rosrm.model.links import LinkReport
-from rosrm.model.orders import AmendInstance, MeasureLinks, RunExecutor, SetLifecycleState
+from rosrm.model.orders import (
+    AmendInstance,
+    MeasureLinks,
+    RestartInstance,
+    RunExecutor,
+    SetLifecycleState,
+)
 from rosrm.model.rows import LogPart
 from rosrm.model.values import (
     RESOURCE_SLOTS,
@@ -304,7 +312,7 @@ class SlaveRuntime:
             report=lambda one, reason: self._take(StartDelayed(one, reason)),
         )  # fmt: skip
         duties = Duties(
-            self._take, self._amend, self._set_lifecycle, self._replication.keep,
+            self._take, self._restart, self._amend, self._set_lifecycle, self._replication.keep,
             self._drop_snapshots, self._execute, self._read_log, self._measure_links, self._reload,
         )  # fmt: skip
         self._services = SlaveServices(
@@ -392,7 +400,7 @@ class SlaveRuntime:
 
     @property
     def _is_registered(self) -> bool:
-        return self._endpoint.link is MasterLink.REGISTERED
+        return self._endpoint.is_registered
 
     @durable.lease_kept_here()
     def _serve(self, condition: Callable[[], bool]) -> None:
@@ -686,8 +694,6 @@ class SlaveRuntime:
             return
         if isinstance(command, commands.Fail):
             _log.info("%s is %s", command.instance, command.reason)
-        if isinstance(command, commands.Restart):  # on request of a user
-            self._starter.launchers.discard_images(command.instance)
         self._supervisor.carry_out(command)
 
     def _filled(self, container: InstanceId, component: Component) -> Callable[[], Component]:
@@ -704,6 +710,18 @@ class SlaveRuntime:
             self._clients.close(status.instance)
 
     # --- requests of the master, and of readers of logs ----------------------------------
+
+    def _restart(self, order: RestartInstance) -> None:
+        """Restart an instance from the beginning; raises `Refused` if an image may be left."""
+        event = RestartOrdered(order.instance, order.run)
+        if restarts(self._state, event):
+            leader = self._state.held[order.instance].status.pid
+            try:
+                self._starter.launchers.discard_images(order.instance, leader)
+            except LaunchError as error:
+                why = f"an image of it may be left, from which it would continue: {error}"
+                raise Refused(why, "unable") from None
+        self._take(event)
 
     def _amend(self, order: AmendInstance, settled: Settled) -> None:
         """Change an instance; call `settled` when the supervisor has recorded or refused it."""

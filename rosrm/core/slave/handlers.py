@@ -238,13 +238,21 @@ def _bury(state: SlaveState, instance: InstanceId) -> None:
     state.tombstones.put(instance, None)
 
 
+def restarts(state: SlaveState, event: events.RestartOrdered) -> bool:
+    """Return True if an order would restart an instance now."""
+    held = state.held.get(event.instance)
+    if held is None or held.status.state.ended or event.instance in state.waiting:
+        return False
+    return event.run is None or event.run.is_that_of(held.status.pid, held.status.restarts)
+
+
 def _restart_ordered(state: SlaveState, event: events.RestartOrdered, now: float) -> _Commands:
     held = state.held.get(event.instance)
     if held is None or held.status.state.ended:
         return [] if held is None else [commands.Report((held.status,))]
     if event.instance in state.waiting:
         return []  # the start itself still waits
-    if event.run is not None and not event.run.is_that_of(held.status.pid, held.status.restarts):
+    if not restarts(state, event):
         return [commands.Report((held.status,))]  # a late copy: its run has ended
     held.ready_by = None
     return [commands.Restart(event.instance, event.run)]

@@ -21,6 +21,7 @@ from rosrm.model.orders import (
     MeasureLinks,
     ReloadSettings,
     ReplicateSnapshot,
+    RestartInstance,
     RunExecutor,
     SetLifecycleState,
     StartInstance,
@@ -75,6 +76,7 @@ class Duties:
 
     Attributes:
         take: takes an event for the core.
+        restart: restarts an instance from the beginning; raises `Refused` if that is impossible.
         amend: changes an instance that runs on. It calls its last argument with "" when the change
             is durable, whichever process is killed, else with the reason why nothing has changed,
             and its code.
@@ -91,6 +93,7 @@ class Duties:
     """
 
     take: Callable[[Event], None]
+    restart: Callable[[RestartInstance], None]
     amend: Callable[[AmendInstance, Callable[[str, str], None]], None]
     set_lifecycle: Callable[[SetLifecycleState, Callable[[str, str], None]], None]
     keep: Callable[[InstanceId, Sequence[str], float], None]
@@ -142,6 +145,8 @@ class SlaveServices:
                 case RunExecutor():
                     self._execute(order, respond)
                     return
+                case RestartInstance():
+                    self._duties.restart(order)
                 case AmendInstance():
                     self._duties.amend(order, _settled(respond))
                     return

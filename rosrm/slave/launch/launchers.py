@@ -8,6 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import islice
 from typing import Any, Final, TypeVar, cast
 
@@ -185,10 +186,27 @@ class Launchers:
         self.calls.note(("launcher", name), "prepare")
         return prepared
 
-    def discard_images(self, instance: InstanceId) -> None:
-        """Have the next start of an instance begin from nothing."""
+    def discard_images(self, instance: InstanceId, leader: int) -> None:
+        """Have the next start of an instance begin from nothing.
+
+        Args:
+            leader: pid of the leader of its session; 0: nothing of it runs.
+
+        Raises:
+            LaunchError: an image may be left, from which the next start would continue.
+        """
+        faults = [
+            f"the launcher {name!r} is not created yet, and may have an image of it"
+            for name in self.awaited if self._may_lack_launcher_of(leader)
+        ]  # fmt: skip
         for name, launcher in self._of(ImageLauncher):
-            self._ask(name, "discard_images", launcher, None, object, instance)
+            discard = partial(launcher.discard_images, instance)
+            try:
+                self.calls.ask("launcher", name, "discard_images", discard, launcher)
+            except PluginError as fault:
+                faults.append(f"the launcher {name!r} fails: discard_images: {fault}")
+        if faults:
+            raise LaunchError("; ".join(faults))
 
     def has_departed(self, leader: int) -> bool | None:
         """Return True while the node of an instance is out of the ROS graph on purpose.
@@ -260,8 +278,6 @@ class Launchers:
 
         def ask() -> T:
             answer = whole(getattr(launcher, method)(argument), hint, method)
-            if hint is object:  # no answer is expected
-                return otherwise
             pids = answer if isinstance(answer, tuple) else (answer,) if hint is int else ()
             if len(pids) > MOST_MEMBERS:
                 raise PluginError(f"{len(pids)} processes; allowed: {MOST_MEMBERS}")

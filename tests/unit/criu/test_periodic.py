@@ -102,6 +102,24 @@ def test_a_start_without_image_happens_once(parent):
     assert slots.newest(parent) == (later, REJOIN)
 
 
+def test_images_that_cannot_be_removed_are_never_used(parent, monkeypatch):
+    """The process starts from the beginning each time until they are removed."""
+    slot = image(parent)
+    slots.complete(slot, REJOIN)
+    slots.start_without_image(parent)
+    remove = slots.shutil.rmtree
+
+    def refuse(path, **_):
+        if path == parent:  # in any order
+            (parent / "anew").unlink()
+
+    monkeypatch.setattr(slots.shutil, "rmtree", refuse)
+    assert [slots.newest(parent) for _ in range(2)] == [None, None]
+    monkeypatch.setattr(slots.shutil, "rmtree", remove)
+    assert slots.newest(parent) is None
+    assert not parent.exists()
+
+
 def test_numbers_grow(parent):
     """Images are ordered by number: the tenth is newer than the ninth."""
     for _ in range(10):

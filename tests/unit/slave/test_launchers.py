@@ -231,7 +231,8 @@ def test_a_launcher_that_fails_leaves_an_instance_as_any_other():
     for _ in range(2):
         assert known.members(10) is None
         assert known.root(10) == 10
-    known.discard_images(InstanceId("p", 7))
+    with pytest.raises(LaunchError, match="'ours' fails: discard_images: "):
+        known.discard_images(InstanceId("p", 7), 10)
     ((plugin, error),) = known.calls.changes(0.0)
     assert plugin == ("launcher", "ours")
     assert f"RuntimeError: out of order ({__file__}:" in error

@@ -82,7 +82,10 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
         OSError: no look at an image is possible now.
     """
     if exists(parent / _IGNORE_IMAGES):
-        shutil.rmtree(parent, ignore_errors=True)
+        for slot in _slots(parent):
+            shutil.rmtree(slot, ignore_errors=True)
+        if not _slots(parent):  # otherwise a later start would continue from what is left
+            shutil.rmtree(parent, ignore_errors=True)
         return None
     for slot in _slots(parent):
         try:
