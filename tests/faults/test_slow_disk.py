@@ -11,7 +11,7 @@ from benchmarks.crash.recording import compiled
 from benchmarks.hosts import Sync
 from rosrm.config.settings import JournalSettings
 from rosrm.model.values import IsolationPolicy
-from tests.ros.clusters import alive, host, job, service
+from tests.ros.clusters import STEADY, alive, host, job, service
 
 #: Milliseconds of a sync. A host without a beat stops isolated processes after 1.4 s.
 SYNC = 3000
@@ -28,7 +28,7 @@ def test_a_slow_disk_of_the_master_stops_no_process(
 
     Requests wait for the disk, too, and jobs are started.
     """
-    cluster = make_cluster(host("h0"), journal=JournalSettings(sync=sync))
+    cluster = make_cluster(host("h0"), journal=JournalSettings(sync=sync), liveness=STEADY)
     library = compiled(Path(slow_sync.__file__).with_name("slow_sync.c"), tmp_path)
     monkeypatch.setenv("SYNC_DELAY_MS", str(SYNC))
     monkeypatch.setenv("LD_PRELOAD", str(library))
