@@ -230,7 +230,7 @@ def test_leftovers_of_a_first_start_that_failed_are_killed(host, client) -> None
     client.start([host.order("next", "true", slots=1, restart=RestartPolicy("always", delay=60.0))])
     host.wait(client, "next", InstanceState.HELD)
     log, group = host.log("next"), group_of(client, "next")
-    wait_until(group.is_dir, "the group of the held instance")  # its log is made before
+    wait_until(lambda: group.is_dir() and log.is_file(), "group and log of the held instance")
     log.unlink()
     log.mkdir()  # the start fails
     with subprocess.Popen(["sleep", "1000"]) as leftover:
