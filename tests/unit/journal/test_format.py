@@ -104,13 +104,16 @@ def written(state: MasterState) -> dict[tuple[str, str], Any]:
 
 
 def with_new_fields(value: Any) -> Any:
-    """Return a migration, or a part of one, with the fields that older journals lack."""
+    """Return a migration, or a part of one, with the fields of the present journal."""
     if isinstance(value, list):
         return [with_new_fields(one) for one in value]
     if not isinstance(value, dict):
         return value
-    new = {"inactive": False} if value.get("kind") == "start" else {}
-    return {**new, **{key: with_new_fields(one) for key, one in value.items()}}
+    new: dict[str, Any] = {"inactive": False} if value.get("kind") == "start" else {}
+    if "exit_code" in value:
+        new["restarts_off"] = False
+    kept = {key: one for key, one in value.items() if key != "suspended"}
+    return {**new, **{key: with_new_fields(one) for key, one in kept.items()}}
 
 
 def test_a_new_journal_has_the_tables_of_the_fixture(tmp_path: Path, path: Path) -> None:
@@ -178,7 +181,10 @@ def test_every_migration_is_taken_up_where_it_was(state: MasterState, name: str)
     state.save_migration(run)
     after = written(state)["migration", name]
     absent = {"source_devices": [], "at": after["at"]}  # in older journals
-    assert after == with_new_fields({**absent, **INTENTS["migration", name]})
+    before = INTENTS["migration", name]
+    assert after == with_new_fields({**absent, **before})
+    off = {one.id.number for one in state.instances.values() if one.restarts_off}
+    assert off & {run.source.number, *after["launched"]} == set(before["suspended"])
     in_hand = run.current_step
     assert in_hand is not None
     steps = {
