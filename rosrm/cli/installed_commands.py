@@ -21,7 +21,6 @@ from rosrm.cli.groups import CommandLineError, PlainCommand, add_command
 from rosrm.errors import PluginError, RosrmError, describe_plugin_fault
 from rosrm.extensions.guard import guarded
 from rosrm.extensions.installed import COMMANDS, PluginAddress, installed_plugins
-from rosrm.extensions.process_state import Interrupts
 from rosrm.model.rows import PluginRow
 from rosrm.runtime.durable import NO_ROOM
 from rosrm.wording import listed
@@ -30,6 +29,10 @@ from rosrm.wording import listed
 _LOADING: Final = 60.0
 #: Errors of writing the output, which the entry point of the command reports.
 _OF_OUTPUT: Final = (errno.EPIPE, *NO_ROOM)
+#: What ends a command that works. A command that defers Ctrl-C raises `KeyboardInterrupt` itself.
+_NO_FAULT: Final = (
+    RosrmError, typer.Exit, typer.Abort, CommandLineError, SystemExit, KeyboardInterrupt,
+)  # fmt: skip
 
 
 def find_commands() -> dict[str, list[PluginAddress]]:
@@ -83,15 +86,12 @@ def _guarded(command: Any, address: PluginAddress) -> Any:
     invoke = command.invoke
 
     def guarded(ctx: Any) -> Any:
-        interrupts = Interrupts()
         try:
             return invoke(ctx)
-        except (RosrmError, typer.Exit, typer.Abort, CommandLineError, SystemExit):
+        except _NO_FAULT:
             raise
         except BaseException as fault:
             if isinstance(fault, OSError) and fault.errno in _OF_OUTPUT:
-                raise
-            if isinstance(fault, KeyboardInterrupt) and interrupts.pressed:
                 raise
             if os.environ.get("ROSRM_TRACEBACK"):
                 traceback.print_exc()
@@ -99,8 +99,6 @@ def _guarded(command: Any, address: PluginAddress) -> Any:
                 f"the command {address.name!r} of {address.distribution} failed: "
                 f"{describe_plugin_fault(fault)}; ROSRM_TRACEBACK=1 shows the whole traceback"
             ) from fault
-        finally:
-            interrupts.end()
 
     command.invoke = guarded
     return command

@@ -85,6 +85,7 @@ RULES: dict[str, Any] = {
     "pid": st.integers(-1, 3) | uint64s, "code": st.integers(-1, 300),
     "signal": st.integers(-1, 70), "peak_memory": floats, "cpu_time": floats,
     "heard": st.none() | SECONDS, "enforced": st.lists(texts, max_size=3).map(tuple), "note": texts,
+    "unfound": texts,
     "out_of_memory": st.none() | st.tuples(floats, floats),
     "kill": st.booleans(), "transient": st.booleans(), "leftovers": st.booleans(),
     "adopted": st.booleans(), "slots": NUMBERS, "seconds": SECONDS,

@@ -287,7 +287,7 @@ def test_ctrl_c_during_up_leaves_nothing(name):
         assert b"Traceback" not in said
         if process.returncode == 0:  # `up` was complete already
             Lab(name).down()
-        assert remains(name) == before
+        assert remains(name) == before, (process.returncode, said)
 
 
 def test_the_command_line_from_up_to_down(name):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import pytest
 
 from rosrm.cli import command_tree
@@ -30,6 +32,13 @@ def saw(times: int) -> None:
 def spoil() -> None:
     """Fail."""
     raise KeyError("salt")
+
+def settle(stop: bool = False) -> None:
+    """Defer Ctrl-C, and ignore it from now on."""
+    import signal
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if stop:
+        raise KeyboardInterrupt
 
 number = 7
 '''
@@ -107,6 +116,19 @@ def test_a_command_with_the_name_of_one_of_rosrm_is_listed_as_broken(rosrm, inst
     rows = [line for line in rosrm("plugins", "--local").out.splitlines() if "acme" in line]
     assert len(rows) == 1
     assert "its command is ignored, because rosrm has one of this name" in rows[0]
+
+
+@pytest.mark.parametrize(("options", "code"), [((), 0), (("--stop",), 130)])
+def test_a_command_decides_when_ctrl_c_ends_it(rosrm, installed, options, code):
+    """Ctrl-C that it deferred is no fault; what it ignores cannot end the process any more."""
+    installed("acme", "settle = acme_commands:settle")
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        result = rosrm("settle", *options)
+        assert (result.code, result.err) == (code, "")
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.parametrize("traceback", [False, True])
