@@ -13,8 +13,8 @@ from rosrm.config.settings import JournalSettings
 from rosrm.model.values import IsolationPolicy
 from tests.ros.clusters import STEADY, alive, host, job, service
 
-#: Milliseconds of a sync. A host without a beat stops isolated processes after 1.4 s.
-SYNC = 3000
+#: Milliseconds of a sync. A request may wait for three of them, and its client waits 10 s.
+SYNC = 2000
 #: Bytes of a job. The intents of forty exceed the write-ahead log, so a checkpoint begins.
 LARGE = 40_000
 

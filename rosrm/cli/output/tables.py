@@ -179,7 +179,8 @@ def why(row: ProcessRow) -> str:
 
 def hosts(rows: Sequence[HostRow]) -> Table:
     """Return the table of `rosrm hosts`: usage and limit, in percent of the capacity."""
-    resources = list(dict.fromkeys(r.name for row in rows for r in row.resources))
+    # By name: a probe that is late registers last, which must not move the columns.
+    resources = sorted({resource.name for row in rows for resource in row.resources})
     numbers = ("RUNS", *(f"{name} %" for name in resources))
     free = ("FREE DEVICES",) if any(row.devices for row in rows) else ()
     made = table("HOST", "STATE", *numbers, *free, right=numbers)

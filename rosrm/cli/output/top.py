@@ -127,7 +127,7 @@ def _hosts(hosts: Sequence[HostRow], width: int) -> Iterator[Text]:
     if not hosts:
         yield Text("no host yet", "yellow")
         return
-    found = dict.fromkeys(resource.name for row in hosts for resource in row.resources)
+    found = sorted({resource.name for row in hosts for resource in row.resources})
     first = [name for name in _FIRST if name in found]
     names = [*first, *(name for name in found if name not in first)][:_MOST_RESOURCES]
     cells = {"HOST": [_host(row) for row in hosts], "RUNS": [Text(str(r.processes)) for r in hosts]}

@@ -56,8 +56,7 @@ def host_row(state: MasterState, host: Host, now: float) -> HostRow:
     stale = set(table.stale_resources(host))
     condition = table.condition_of(host)
     rows = []
-    # By name: a probe that is late registers last, which must not move the columns of a table.
-    for resource in sorted(host.description.resources, key=lambda one: one.name):
+    for resource in host.description.resources:
         at = table.resources.index(resource.name)
         rows.append(
             ResourceRow(

@@ -59,6 +59,12 @@ def test_explain_takes_a_host_if_no_process_has_the_name(rosrm, client):
     assert rosrm("explain", "alpha").out == "no process has to leave alpha\n"
 
 
+def test_the_columns_of_resources_do_not_move(rosrm, client):
+    """A probe that is late registers last."""
+    client.hosts = [host("a", resources=[resource("memory"), resource("cpu")])]
+    assert rosrm("hosts").out.splitlines()[0].split()[3:] == ["cpu", "%", "memory", "%"]
+
+
 def test_hosts_with_devices_show_the_free_ones(rosrm, client):
     """Shares of units count; missing units are named, and only listed in a column of their own."""
     assert "DEVICES" not in rosrm("hosts").out

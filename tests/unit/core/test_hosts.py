@@ -422,15 +422,3 @@ def test_an_unknown_instance_is_ordered_to_stop_until_it_has_ended() -> None:
     cluster.wait(0.5)
     assert cluster.phase("ghost") == "running"
     assert not cluster.state.strays
-
-
-# --- listing ----------------------------------------------------------------------------------
-
-
-def test_resources_are_listed_by_name_because_a_late_probe_registers_last() -> None:
-    """The columns of a table do not move with the moment at which a probe was ready."""
-    names = ("memory", "disk", "cpu")
-    late = Machine("a", resources=tuple(ResourceDescription(name, "1", 1.0) for name in names))
-    cluster = Cluster(late)
-    (row,) = listing.host_rows(cluster.state, cluster.now)
-    assert [one.name for one in row.resources] == ["cpu", "disk", "memory"]
