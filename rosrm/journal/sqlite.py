@@ -17,7 +17,7 @@ import os
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from rosrm import clocks
 from rosrm.journal.errors import fault_of, no_journal, other_version, removed
@@ -47,6 +47,26 @@ _PATIENCE_MS: Final = 200
 #: Bytes of the write-ahead log beyond which a checkpoint begins it again. The first write after a
 #: checkpoint cuts the file to this size, so a longer file has new content.
 _LONGEST_LOG: Final = 4 << 20
+
+
+class Group(NamedTuple):
+    """Records and intents that are written together, rendered as text.
+
+    Attributes:
+        records: in order.
+        facts: text of the facts of each record.
+        wall: unix time, seconds.
+        now: seconds since the start of the master.
+        kept: table, key and text of each intent.
+        deleted: table and key of each intent that no longer holds.
+    """
+
+    records: Sequence[Record]
+    facts: Sequence[str]
+    wall: float
+    now: float
+    kept: Sequence[tuple[str, str, str]]
+    deleted: Sequence[tuple[str, str]]
 
 
 class SqliteJournal:
@@ -181,25 +201,31 @@ class SqliteJournal:
             JournalBlocked: a temporary failure; nothing was changed, and a retry is safe.
             JournalError: the file is damaged.
         """
-        stored = self.commit(records, intents, now)
+        stored = self.commit(self.render(records, intents, now))
         if self.is_untidy:
             self.tidy()
         return stored
 
-    def commit(
-        self, records: Sequence[Record], intents: Sequence[Intent], now: float
-    ) -> Sequence[StoredRecord]:
+    def render(self, records: Sequence[Record], intents: Sequence[Intent], now: float) -> Group:
+        """Return a group as text; the policy that made a decision renders it here."""
+        facts = [mapping_to_json(record.facts) for record in records]
+        newest = {(intent.table, intent.key): intent.value for intent in intents}
+        kept = [(*at, mapping_to_json(value)) for at, value in newest.items() if value is not None]
+        deleted = [at for at, value in newest.items() if value is None]
+        return Group(records, facts, self._wall(), now, kept, deleted)
+
+    def commit(self, group: Group) -> Sequence[StoredRecord]:
         """Write a group; raises as `write`. As long as the journal `is_untidy`, call `tidy` next.
 
         So no group waits for the disk longer than its own promise needs.
         """
         durable.check_thread()
-        wall = self._wall()
-        first = self._sequence + 1
-        stored = [StoredRecord(first + i, wall, now, record) for i, record in enumerate(records)]
-        newest = {(intent.table, intent.key): intent.value for intent in intents}
-        rows = [_row(one) for one in stored]
-        self._guarded(lambda: self._write(rows, newest))
+        stored = [
+            StoredRecord(number, group.wall, group.now, record)
+            for number, record in enumerate(group.records, self._sequence + 1)
+        ]
+        rows = list(map(_row, stored, group.facts))
+        self._guarded(lambda: self._write(rows, group))
         self._sequence += len(stored)
         self._retention.add(rows)
         self._is_long = self._log_size() > _LONGEST_LOG
@@ -227,28 +253,14 @@ class SqliteJournal:
             with contextlib.suppress(sqlite3.Error):
                 self._database.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
 
-    def _write(
-        self,
-        rows: Sequence[Row],
-        intents: Mapping[tuple[str, str], Mapping[str, Any] | None],
-    ) -> None:
+    def _write(self, rows: Sequence[Row], group: Group) -> None:
         self._check_files()
         database = self._database
         database.execute("BEGIN IMMEDIATE")
         try:
             database.executemany("INSERT INTO record VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
-            database.executemany(
-                "INSERT OR REPLACE INTO intent VALUES (?, ?, ?)",
-                [
-                    (table, key, mapping_to_json(value))
-                    for (table, key), value in intents.items()
-                    if value is not None
-                ],
-            )
-            database.executemany(
-                "DELETE FROM intent WHERE tbl = ? AND key = ?",
-                [at for at, value in intents.items() if value is None],
-            )
+            database.executemany("INSERT OR REPLACE INTO intent VALUES (?, ?, ?)", group.kept)
+            database.executemany("DELETE FROM intent WHERE tbl = ? AND key = ?", group.deleted)
             database.execute("COMMIT")
         except BaseException:  # also an interrupt must leave no open transaction
             if database.in_transaction:
@@ -324,11 +336,11 @@ class SqliteJournal:
         self._guarded(self._database.close)
 
 
-def _row(stored: StoredRecord) -> Row:
+def _row(stored: StoredRecord, facts: str) -> Row:
     record = stored.record
     return (
         stored.sequence, stored.wall_time, stored.elapsed, str(record.kind), record.process,
-        record.host, record.message, mapping_to_json(record.facts),
+        record.host, record.message, facts,
     )  # fmt: skip
 
 

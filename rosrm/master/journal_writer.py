@@ -58,7 +58,9 @@ class JournalWriter:
             JournalBlocked: a temporary failure; nothing was changed, and a retry is safe.
             JournalError: the file is damaged.
         """
-        self._write = self._thread.begin(partial(self._journal.commit, records, intents, elapsed))
+        # Only in this thread is a plugin, which renders its decision, called with a time-out.
+        group = self._journal.render(records, intents, elapsed)
+        self._write = self._thread.begin(partial(self._journal.commit, group))
         return self.outcome()
 
     def outcome(self) -> Sequence[StoredRecord]:
@@ -93,7 +95,8 @@ class JournalWriter:
 
     def write_last(self, record: Record, elapsed: float) -> None:
         """Write the last record, and wait for it up to 10 s; raises as `write`."""
-        call = self._thread.begin(partial(self._journal.commit, [record], [], elapsed))
+        group = self._journal.render([record], [], elapsed)
+        call = self._thread.begin(partial(self._journal.commit, group))
         if not call.wait(_AT_END):
             raise self._late(self._thread.waits())
         call.result()

@@ -505,7 +505,8 @@ def test_only_the_answered_groups_are_moved_out_of_the_log(path, opened) -> None
 
     def commit() -> None:
         number = next(values)
-        journal.commit([], [Intent("process", f"p{number}", {"x": "y" * 200_000})], 0.0)
+        intent = Intent("process", f"p{number}", {"x": "y" * 200_000})
+        journal.commit(journal.render([], [intent], 0.0))
 
     while not journal.is_untidy:
         commit()

@@ -6,8 +6,9 @@ import contextlib
 import sqlite3
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,8 @@ from rosrm.errors import JournalBlocked
 from rosrm.journal.sqlite import SqliteJournal
 from rosrm.master import journal_writer
 from rosrm.master.journal_writer import JournalLate, JournalWriter
+from rosrm.model.event_kinds import EventKind
+from rosrm.model.lazy import Lazy
 from rosrm.model.records import Intent, Record, StoredRecord
 from tests.waiting import wait_until
 
@@ -155,3 +158,18 @@ def test_beats_are_sent_until_the_first_group_is_durable(writer, journal) -> Non
     writer.write_durably([Record("started")], [], meanwhile=beat)
     assert len(beats) >= 3
     assert journal.last_sequence == 1
+
+
+def test_a_decision_is_rendered_in_the_thread_that_bounds_calls_of_plugins(
+    writer: JournalWriter,
+) -> None:
+    """A policy that renders its decision may hang."""
+    threads = []
+
+    class Decided(Lazy):
+        def render(self) -> Mapping[str, Any]:
+            threads.append(threading.current_thread())
+            return {"host": "a"}
+
+    writer.write([Record(EventKind.ASSIGNED, facts={"decision": Decided()})], [], 0.0)
+    assert threads == [threading.current_thread()]
