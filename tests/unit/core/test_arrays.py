@@ -122,6 +122,28 @@ def test_a_gang_takes_all_of_its_places_at_once(backfill: bool) -> None:
     assert running(cluster) == (["p", "r-2", "r-3"] if backfill else ["p", "r-3", "r-4"])
 
 
+def test_a_gang_that_is_queued_in_part_waits_behind_a_gang_that_awaits_places() -> None:
+    """Its other member is being stopped on a host that does not answer."""
+    cluster = Cluster(Machine("a", labels={"on": "a"}), Machine("b", labels={"on": "b"}))
+
+    def of(name: str, index: int, **more: Any) -> ProcessSpec:
+        return job(name, array=ArrayMembership("A", index, 3), **more)
+
+    cluster.with_processes(of("x", 1))
+    cluster.machines["a"].refuses["refused"] = "no such file"
+    cluster.machines["b"].connected = False
+    cluster.submit(
+        of("refused", 2, together="second", required_labels={"on": "a"}),
+        job("stopped", together="second", required_labels={"on": "b"}),
+    )
+    cluster.submit(*(of(f"first{n}", 3 + n, together="first", priority=5) for n in range(3)))
+    cluster.wait(1.0)
+    assert (cluster.phase("refused"), cluster.phase("stopped")) == ("queued", "stopping")
+    cluster.restart_master()
+    cluster.wait(1.0)
+    assert (cluster.phase("refused"), cluster.phase("stopped")) == ("queued", "unreachable")
+
+
 def test_no_process_makes_room_for_a_job_without_a_place() -> None:
     """Of two jobs for one place, room is made for the first."""
     cluster = Cluster(machine("a"), preemption="requeue", backfill=True, hysteresis=0.5)

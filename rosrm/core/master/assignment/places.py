@@ -73,5 +73,6 @@ def _is_reserved(state: MasterState, process: Process, array: ArrayKey) -> bool:
     key = state.queue.arrays.reserved.get(array)
     if key is None or key[2] not in state.queue:
         return False
-    first = min(state.queue.key_of(one.name) for one in members_of(state, process))
-    return key < first
+    # Another member may not be in the queue: it is being stopped on a silent host.
+    queued = [one.name for one in members_of(state, process) if one.name in state.queue]
+    return key < min(map(state.queue.key_of, queued), default=key)
