@@ -123,8 +123,8 @@ def prepared(path: str, content: bytes) -> Iterator[Callable[[], None]]:
         OSError: the new file cannot be written.
     """
     new = f"{path}.new"
+    _write(new, content)
     try:
-        _write(new, content)
         _sync_file(new)
         yield partial(_give_name, new, path)
     finally:
@@ -152,10 +152,11 @@ def replace_all_durably(contents: Mapping[str, bytes]) -> dict[str, OSError]:
                 faults[path] = error
 
     attempt(lambda path: _write(written[path], contents[path]))
-    whole = _together(_sync_file, [written[path] for path in contents.keys() - faults.keys()])
+    unwritten = set(faults)
+    whole = _together(_sync_file, [written[path] for path in contents.keys() - unwritten])
     faults |= {path: whole[new] for path, new in written.items() if new in whole}
     attempt(lambda path: os.replace(written[path], path))
-    for path in faults:
+    for path in faults.keys() - unwritten:
         with contextlib.suppress(OSError):
             os.unlink(written[path])
     folders = {path: os.path.dirname(path) for path in contents.keys() - faults.keys()}
@@ -261,9 +262,14 @@ def _together(force: Callable[[str], None], paths: Sequence[str]) -> dict[str, O
 
 
 def _write(path: str, content: bytes) -> None:
+    """Write a file, of which a failure leaves nothing; a FIFO or link in its place stays."""
     file = open_private(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     try:
         write_all(file, content)
+    except BaseException:
+        with contextlib.suppress(OSError):  # the first fault is the reason
+            os.unlink(path)
+        raise
     finally:
         os.close(file)
 
