@@ -8,7 +8,6 @@ import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import islice
 from typing import Any, Final, TypeVar, cast
 
@@ -199,14 +198,23 @@ class Launchers:
             f"the launcher {name!r} is not created yet, and may have an image of it"
             for name in self.awaited if self._may_lack_launcher_of(leader)
         ]  # fmt: skip
-        for name, launcher in self._of(ImageLauncher):
-            discard = partial(launcher.discard_images, instance)
-            try:
-                self.calls.ask("launcher", name, "discard_images", discard, launcher)
-            except PluginError as fault:
-                faults.append(f"the launcher {name!r} fails: discard_images: {fault}")
+        if not faults:  # else the instance runs on, and keeps its images
+            faults = [
+                fault for name, launcher in self._of(ImageLauncher)
+                if (fault := self._fault_of_discarding(name, launcher, instance))
+            ]  # fmt: skip
         if faults:
             raise LaunchError("; ".join(faults))
+
+    def _fault_of_discarding(self, name: str, launcher: ImageLauncher, instance: InstanceId) -> str:
+        try:
+            self.calls.ask(
+                "launcher", name, "discard_images",
+                lambda: launcher.discard_images(instance), launcher,
+            )  # fmt: skip
+        except PluginError as fault:
+            return f"the launcher {name!r} fails: discard_images: {fault}"
+        return ""
 
     def has_departed(self, leader: int) -> bool | None:
         """Return True while the node of an instance is out of the ROS graph on purpose.

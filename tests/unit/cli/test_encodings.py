@@ -48,7 +48,7 @@ def test_every_listing_is_shown_in_every_encoding(rosrm, client, command, charse
     client.plugins = [replace(PLUGINS[0], reason=FOREIGN, state="failing")]
     client.events = [event(1, message=FOREIGN)]
     client.trouble = FOREIGN
-    client.explain = lambda _: {**STORY, "reason": FOREIGN}
+    client.explain = lambda _: {**STORY, "reason": FOREIGN, "reasons": [FOREIGN]}
     ran = rosrm(*command.split(), charset=charset)
     assert ran.code == 0, ran.err
     client.fails = Refused(FOREIGN)
