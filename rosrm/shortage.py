@@ -1,10 +1,10 @@
-"""Public. Errors of a look at a file or process: which tell that it does not exist, and which not.
+"""Public. Distinction between a missing file or process and an error in the search for it.
 
-Code that took another one for "it does not exist" ended a process that runs, or deleted the only
-copy of a state.
+Code that treated any error as absence ended a running process, or deleted the only copy of a state.
 
-`os.path.exists` and its kin, and from Python 3.14 on those of `pathlib` with `glob`, are False or
-empty after any error. The functions here are so only for what certainly does not exist.
+`os.path.exists` and similar functions return False or nothing after any error; from Python 3.14 on,
+so do those of `pathlib`, and its `glob`. The functions here do so only for a file that certainly
+does not exist.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = [
 
 #: No room for another open file, or no memory.
 SHORTAGE: Final = frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
-#: Nothing has this path, or a device file has no device.
+#: Errors for a path that does not exist, and for a device file without a device.
 ABSENT: Final = frozenset({errno.ENOENT, errno.ENOTDIR, errno.ELOOP, errno.ENODEV, errno.ENXIO})
 
 
@@ -33,7 +33,7 @@ def raise_shortage(error: OSError) -> None:
 
 
 def raise_unless_absent(error: OSError) -> None:
-    """Raise an error unless the file, or the process of a file in /proc, does not exist."""
+    """Raise an error again unless it means that a file, or a process in /proc, does not exist."""
     if error.errno not in (*ABSENT, errno.ESRCH):
         raise error
 
@@ -85,7 +85,10 @@ def names(directory: str | os.PathLike[str]) -> list[str]:
 
 
 def tree(directory: str | os.PathLike[str]) -> Iterator[str]:
-    """Yield the paths of all that is below a directory, without following links; as `names`."""
+    """Yield the paths of all files and directories below a directory, without following links.
+
+    Raises `OSError` as `names`.
+    """
     for name in names(directory):
         path = f"{os.fspath(directory)}/{name}"
         yield path

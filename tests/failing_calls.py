@@ -42,7 +42,8 @@ def nth_call_fails(
     """Let the nth call of this thread in this context fail, counted from 0.
 
     Args:
-        number: the error.
+        n: number of calls that succeed before.
+        number: errno of the error.
         also: functions in Python that count as calls, such as those that call C by ctypes.
     """
     count, me, others = Count(n), os.getpid(), {call.__code__ for call in also}
@@ -70,13 +71,13 @@ def nth_call_fails(
         sys.setprofile(None)
 
 
-#: Values whose methods have names of `CALLS`.
+#: Types with methods that have names of `CALLS` and call no system call.
 _NO_FILES = (str, bytes, list, dict, type)
 
 
 @contextmanager
 def uncounted() -> Iterator[None]:
-    """Let no call in this context count or fail: those of the test."""
+    """Exempt the calls in this context, which are those of the test, from counting and failures."""
     former = sys.getprofile()
     sys.setprofile(None)
     try:

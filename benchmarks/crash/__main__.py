@@ -3,7 +3,7 @@
 A real cluster is recorded. After each recorded call the legal states of ext4 and XFS are made, and
 the real reader of each part starts on each that differs from all before: the master's journal, the
 keys, the supervisor of each host, the snapshots of all hosts, the archive of logs. A fault is a
-promise of docs/faults.md that a state breaks.
+state that breaks a promise of docs/faults.md.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def _states(
 ) -> Iterator[tuple[FileSystem, str, State]]:
     """Yield the states of a share of the moments, and of the last one, each with its part.
 
-    Each part has a disk of its own: no sync of another part forces anything to it.
+    Each part has a disk of its own, because a sync of another part must force nothing to it.
     """
     calls = list(recording.calls())
     draw = random.Random(arguments.seed)  # noqa: S311 - no secret
@@ -67,7 +67,7 @@ def _states(
 
 
 def _losses(state: State, disks: Mapping[str, Disk], draw: random.Random) -> Iterator[State]:
-    """Yield the snapshots of all hosts if one of them, or each, loses its power."""
+    """Yield the snapshots of all hosts after one host, or each host, has lost its power."""
     hosts = {directory_of(host) for host in HOSTS}
     if hosts.isdisjoint(state.lost):
         return
@@ -77,7 +77,7 @@ def _losses(state: State, disks: Mapping[str, Disk], draw: random.Random) -> Ite
 
 
 def _digest(state: State, part: str) -> bytes:
-    """Return a digest of a state, with the answers that its user had."""
+    """Return a digest of a state, with the answers that the user had received."""
     found = hashlib.blake2b(digest_size=16)
     for path, content in sorted(state.entries.items()):
         found.update(f"{path}\0".encode())

@@ -160,7 +160,7 @@ class Disk:
     Args:
         kind: of the file system.
         attributes: of each inode, at the end of the recording.
-        directory: the disk has only what is below it; other disks lose their power at other
+        directory: directory that is this disk; "": all. Other disks may lose their power at other
             moments.
     """
 
@@ -183,10 +183,10 @@ class Disk:
         return self._names[-1]
 
     def apply(self, call: Call) -> bool:
-        """Apply the next call; return True if it changes this disk, or what a user knows.
+        """Apply the next call; return True if it changes this disk or the answers to the user.
 
         Raises:
-            KeyError: no call has made the file.
+            KeyError: the call is on a file that no earlier call has created.
         """
         self._at += 1
         if not self._is_here(call):
@@ -272,7 +272,7 @@ class Disk:
             yield self._state(cut, data, draw)
 
     def running(self) -> State:
-        """Return what the running machine reads, as long as it keeps its power."""
+        """Return the state that a machine without a loss of power reads."""
         state = self._state(len(self._names) - 1, Data.ALL, None)
         return replace(state, how=f"{self._directory} runs", lost=())
 

@@ -35,7 +35,7 @@ from rosrm.supervisor.client import SupervisorClient
 
 _PATIENCE: Final = 20.0
 _OTHER_BOOT: Final = "00000000-0000-0000-0000-000000000000"
-#: Part of a directory whose states are those of all hosts together.
+#: Directory of the snapshots of a host. The states of this part are those of all hosts together.
 SNAPSHOTS: Final = "kept"
 _ENDED: Final = {"finished", "failed", "cancelled"}
 _UNSETTLED: Final = {InstanceState.STARTING, InstanceState.HELD, InstanceState.STOPPING}
@@ -136,7 +136,7 @@ class Oracle:
                 yield f"{name} runs with other files: {found}, not one of {self._first[name]}"
 
     def _snapshots(self, state: State) -> Iterator[str]:
-        """Choose the snapshot of the counter as a master and a slave do, and read it."""
+        """Check the snapshot of the counter that a master and a slave would choose."""
         index, stores = ReplicaIndex(), {}
         for host in HOSTS:
             stores[host] = SnapshotStore(self._root / directory_of(host) / SNAPSHOTS, 1 << 30)
@@ -213,13 +213,13 @@ def directory_of(host: str) -> str:
 
 
 def _told(state: State, verb: str) -> set[str]:
-    """Return the names about which the user had this answer."""
+    """Return the names of the processes about which the user received an answer."""
     words = (line.split() for line in state.told)
     return {name for what, name, *_ in words if what == verb}
 
 
 def _lines(effects: Path) -> dict[str, set[str]]:
-    """Return the name of each process that has started to what it was started with."""
+    """Map the name of each process that has started to the checksums of the files of each start."""
     found = defaultdict[str, set[str]](set)
     for line in effects.read_text().splitlines():
         name, _, sums = line.partition(" ")

@@ -23,9 +23,9 @@ from rosrm.config.work import processes_of
 from rosrm.model.applications import RolloutPolicy, Target
 from rosrm.testing.local_cluster import LocalCluster
 
-#: Names of the hosts; the second one takes work after the steps that need one host alone.
+#: Names of the hosts; the second one joins after the steps that need a single host.
 HOSTS: Final = ("host0", "host1")
-#: Process with a state, whose snapshots have replicas.
+#: Name of the process that has a state and replicas of its snapshots.
 COUNTER: Final = "counter"
 _ROOT: Final = Path(__file__).resolve().parents[2]
 _PATIENCE: Final = 120.0
@@ -34,7 +34,8 @@ _CYCLES: Final = 8
 APPLICATION: Final = "map"
 _PARTS: Final = ("planner", "driver")
 _QUICK: Final = RolloutPolicy(healthy_for=0.5)
-#: Program of each process but the counter: it tells what it found, and a service runs on.
+#: Program of each process but the counter. It appends checksums of its files to the effects; a
+#: service then keeps running.
 _PROGRAM: Final = """#!/bin/sh
 name=${ROSRM_INSTANCE%%#*} then=$1 effects=$2 artifact=$3
 while [ $# -gt 0 ]; do [ "$1" = --params-file ] && parameters=$2; shift; done
@@ -106,7 +107,7 @@ class Scenario:
             try:
                 yield
             finally:
-                one.terminate()  # SIGINT is ignored in the background
+                one.terminate()  # a process in the background ignores SIGINT
 
     def _play(self) -> None:
         self._keys()
@@ -201,7 +202,7 @@ class Scenario:
         self._wait(COUNTER, "ended")
 
     def _await_replicas(self) -> None:
-        """Wait until the other host has reported two replicas, one some cycles after the other."""
+        """Wait until the other host has reported two replicas, at least `_CYCLES` cycles apart."""
         newest, deadline = 0, clocks.boot_time() + _PATIENCE
         for _ in range(2):
             while not (found := self._replica(newest + _CYCLES)):
@@ -212,7 +213,7 @@ class Scenario:
             self._recording.mark(f"kept {' '.join(map(str, found))}")
 
     def _replica(self, sequence: int) -> tuple[int, int, str] | None:
-        """Return number, sequence and host of the counter's replica, if it has enough cycles."""
+        """Return number, sequence and host of the counter's replica from a sequence on."""
         home = self._client.get_process(COUNTER).host
         for one in self._client.explain(COUNTER)["kept"]:
             if one["host"] != home and one["sequence"] >= sequence:

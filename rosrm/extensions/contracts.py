@@ -516,7 +516,7 @@ class ImageLauncher(Protocol):
     def discard_images(self, instance: InstanceId) -> None:
         """Discard the images of an instance, because a user restarts it without its old memory.
 
-        If this raises or is late, the restart is refused with the reason.
+        If this raises an exception or is late, the slave refuses the restart with the reason.
         """
 
 

@@ -64,7 +64,7 @@ class Retention:
         keep_bytes: most bytes of their texts.
 
     Attributes:
-        is_exceeded: `delete` has something to do.
+        is_exceeded: old events exceed a bound, so `delete` has something to do.
     """
 
     def __init__(self, database: sqlite3.Connection, keep_events: int, keep_bytes: int) -> None:

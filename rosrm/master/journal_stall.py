@@ -1,10 +1,10 @@
 """Journal stall: the state of a master whose journal is not written yet, or cannot be written.
 
 The decisions of the last turn are neither executed nor lost. The master waits for a slow write, and
-retries a failed one; it executes them and decides again only after that succeeds. During the stall
-the master sends beats, receives readings and answers queries. It refuses other requests, but while
-a write is merely slow it first holds them for some seconds. The core's clock is stopped, so that no
-deadline passes and no host counts as silent.
+retries a failed one. It executes the decisions, and decides again, only after the write succeeds.
+During the stall the master sends beats, receives readings and answers queries. It refuses other
+requests; while a write is merely slow, it first holds them for some seconds. The core's clock is
+stopped, so that no deadline passes and no host counts as silent.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from rosrm.master.journal_writer import JournalLate
 _log = logging.getLogger("rosrm.master")
 
 #: Seconds for which requests are held while a write is slow. A client waits 10 s for an answer, so
-#: that it receives the reason of a refusal.
+#: it receives the reason of a refusal.
 _HOLD: Final = 5.0
 #: Most queued status batches; the master requests the rest again from the slaves.
 _MOST_STATUSES: Final = 10_000
-#: Events with an answer that somebody waits for.
+#: Events whose sender waits for an answer.
 _REQUESTS: Final = (happened.HostRegistered, *get_args(happened.ClientRequest))
 #: Events that are dropped, because they recur.
 _DROPPED: Final = (
@@ -44,8 +44,8 @@ class JournalStall:
 
     Attributes:
         commands: the commands that are not durable yet, in order.
-        fault: the last failure, or a `JournalLate`: the write continues.
-        since: monotonic time of the first failure, seconds.
+        fault: the last failure; a `JournalLate` means that the write continues.
+        since: monotonic time at which the first write was late or failed, seconds.
         core_now: time of the core's stopped clock.
         tried: monotonic time of the last attempt to write, seconds.
         refuses: True: requests are refused; False: they are held.

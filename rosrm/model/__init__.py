@@ -8,7 +8,7 @@ artifacts.py            files and directories that processes get on their hosts
 placeholders.py         placeholders in the texts of a process, which its host replaces
 start_trace.py          trace of one start in the environment of its process, traced_values.py
 parameters.py           ROS parameters from several sources, by patterns of nodes
-relative_files.py        words of a command that name files in its working directory
+relative_files.py       words of a command that name files in its working directory
 devices.py              devices of hosts, needs of processes, and what a process gets
 plan.py                 plans of migrations: steps, undo, commit
 orders.py               orders of the master to a slave

@@ -48,11 +48,11 @@ class RestartInstance:
     run: Run | None = None
 
 
-#: Codes of the refusal of an `AmendInstance` or `SetLifecycleState`: the slave knows the instance,
-#: and cannot carry out the order; the instance has ended, which a report follows; or the slave does
-#: not know it.
+#: Codes with which a slave refuses an `AmendInstance` or `SetLifecycleState` that it cannot carry
+#: out.
 NOT_AMENDED: Final = "not_amended"
 NOT_REACHED: Final = "unable"
+#: The same for an instance that has ended (a report follows), and for an unknown one.
 ENDED: Final = "ended"
 UNKNOWN: Final = "unknown"
 #: Code of the refusal of an order that is not for this run of the slave: nothing was done, and the

@@ -121,7 +121,7 @@ class Start:
     inactive: bool = False
 
     def may_run_beside(self, node: str) -> bool:
-        """Return True if it cannot be taken for an owner of the name of a node that runs."""
+        """Return True if the new instance does not claim the name of a running node at once."""
         return self.node_name not in ("", node) or self.restored or self.inactive
 
 
@@ -286,10 +286,10 @@ def plan_fault(plan: Plan, move: Move, aim: Aim = Aim.MOVE) -> str:
 
 
 def _overlap_fault(plan: Plan, move: Move, aim: Aim) -> str:
-    """Return why a start would wait for the end of the source in vain; "" if none does.
+    """Return why a start would wait for the end of the source for ever; "" if none does.
 
-    Without an overlap the core delays a start of the same name until the source has ended. An
-    executor on its host may end the source.
+    Without an overlap the core delays a start of the same name until the source has ended. A plan
+    with an earlier executor on the host of the source is accepted, because it may end the source.
     """
     if plan.overlap or aim is not Aim.MOVE:
         return ""

@@ -15,15 +15,16 @@ _READ: Final = frozenset({
     ".onnx", ".pcd", ".pgm", ".pl", ".py", ".rb", ".rviz", ".sdf", ".sh", ".toml", ".urdf",
     ".xacro", ".xml", ".yaml", ".yml", ".zsh",
 })  # fmt: skip
-#: Programs whose first word is the path of a script.
+#: Programs whose first argument is the path of a script.
 _INTERPRETERS: Final = ("bash", "dash", "lua", "node", "perl", "python", "ruby", "sh", "zsh")
 
 
 def relative_files(spec: ProcessSpec) -> tuple[str, ...]:
-    """Return the words that name such a file, at most `MOST`; the rest may be outputs or names.
+    """Return the words of a command that name relative files to read, at most `MOST`.
 
     Such a word begins with `./` or `../`, or has the ending of a file that programs read, or is the
-    script of an interpreter. A program in an image has no working directory on the host.
+    script of an interpreter. Other words may be outputs or no files. A program in an image has no
+    working directory on the host, so the result is empty.
     """
     if spec.container.image:
         return ()

@@ -117,7 +117,7 @@ class ComponentLinks:
         try:
             restore_now(node)
             self._executor.add_node(node)
-        except BaseException:  # also an interrupt must leave no node that only the graph knows
+        except BaseException:  # otherwise an interrupt leaves a node that no list has
             destroy(node, self._log.error)
             raise
         self.nodes.append(node)

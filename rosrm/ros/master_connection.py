@@ -60,7 +60,7 @@ _GREET_AGAIN: Final = 0.5
 _UNKNOWN_EPOCH: Final = 0
 #: Tickets that are kept until expired ones are removed.
 _MOST_INTRODUCTIONS: Final = 1000
-#: About a master that was discovered and has not answered.
+#: Advice about a master that was discovered and has not answered.
 _IGNORED: Final = (
     "A master was found there, and did not answer: it has just ended, or this key is not valid any "
     "more, because the cluster's secret was replaced (`rosrm key rotate`, a master with another "
@@ -255,14 +255,14 @@ class MasterClient:
         settings.check()
         try:
             member = user_security(security, timeout)
-        except BaseException:  # also an interrupt must leave no open participant
+        except BaseException:  # otherwise an interrupt leaves an open participant
             if joined is not None:
                 joined.close()
             raise
         client = cls(settings, member, name, max(timeout, _REQUEST), joined)
         try:
             client._greet(timeout, begun)
-        except BaseException:  # also an interrupt must leave no open participant
+        except BaseException:  # otherwise an interrupt leaves an open participant
             client.close()
             raise
         return client

@@ -186,7 +186,7 @@ class CrashNotes:
         return Crash(whom, text)
 
     def _write(self) -> bool:
-        """Store the weights; return False where the disk is full, which changes nothing."""
+        """Store the weights; return False, with the file unchanged, if they cannot be written."""
         try:
             text = json.dumps(self._known).encode()
             os.close(durable.replace_atomically(str(self._weights), text))

@@ -1,4 +1,4 @@
-"""File calls of a loop in a thread: a directory that does not answer blocks no loop.
+"""Thread for the file calls of a loop: a directory that does not answer blocks no loop.
 
 On a file system that does not answer (a dead NFS server, a failing disk), each call waits without
 a limit. So the loop hands its calls on one directory to a thread, which executes them in order. The
@@ -88,7 +88,7 @@ class FileThread:
     Args:
         directory: named in the texts of exceptions.
         patience: most seconds that the loop waits for a call.
-        report: takes the text of a failure of `tell`, while its exception is handled.
+        report: takes the text of a failure of a call of `tell`, while the exception is handled.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class FileThread:
         return True
 
     def tell(self, work: Callable[[], object]) -> None:
-        """Queue a call by the next `begin` or `pass_on`; only `report` has its failure.
+        """Queue a call, which starts with the next `begin` or `pass_on`; `report` gets its failure.
 
         Until then the thread does not compete with the loop for the interpreter.
         """

@@ -47,7 +47,7 @@ def score_of_children() -> Iterator[None]:
     if own == children:
         yield
         return
-    with _writer() as write:  # held, so that the way back needs no room for an open file
+    with _writer() as write:  # kept open, because a later open may fail
         write(children)
         try:
             yield

@@ -6,7 +6,7 @@ from __future__ import annotations
 def show_role(role: str) -> None:
     """Set the name of this process and of its later threads, e.g. to "rosrm-slave".
 
-    The kernel keeps 15 bytes of it. Where /proc cannot be written, the name stays.
+    The kernel keeps 15 bytes of the name. If /proc cannot be written, the name does not change.
     """
     try:
         with open("/proc/self/comm", "w", encoding="ascii") as name:

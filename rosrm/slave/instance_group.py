@@ -96,7 +96,7 @@ def _content(path: str) -> str:
     """Return the content of a control file; "": there is none.
 
     Raises:
-        OSError: no look is possible now.
+        OSError: the file cannot be read now.
     """
     if not path:
         return ""

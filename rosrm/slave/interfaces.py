@@ -91,7 +91,7 @@ class Traffic:
     def _carried(self, name: str) -> float:
         """Return the bytes a second of the busier direction since the last call; 0: the first one.
 
-        After a failed look the last rate stays, because 0 would tell that the link is free.
+        If the counters cannot be read, the last rate stays, because 0 would mean a free link.
         """
         try:
             received, sent = (

@@ -229,7 +229,7 @@ def _content(path: str, most: int) -> bytes:
     """Return the first bytes of a file of a process; b"": the process has ended.
 
     Raises:
-        OSError: no look is possible now.
+        OSError: the file cannot be read now.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY)
@@ -237,7 +237,7 @@ def _content(path: str, most: int) -> bytes:
             return os.read(descriptor, most)
         finally:
             os.close(descriptor)
-    except PermissionError:  # it is hidden, as one of another user
+    except PermissionError:  # a process of another user
         return b""
     except OSError as error:
         raise_unless_absent(error)

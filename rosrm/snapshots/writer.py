@@ -209,9 +209,9 @@ def write_slot(directory: Path, content: bytes) -> None:
 def drop_torn(directory: Path) -> list[Path]:
     """Delete the slots that look newer than the newest complete one; return their paths.
 
-    A loss of power may leave the new header of a slot and not its new content. The header alone
-    would count as the newest snapshot, also before a replica on another host. A slot that its node
-    writes now stays.
+    A loss of power may leave the new header of a slot without its new content. That header would
+    count as the newest snapshot, also compared with replicas on other hosts. A slot that its node
+    is writing now is not deleted.
 
     Raises:
         OSError: too many files are open, or memory is short.
@@ -226,7 +226,9 @@ def drop_torn(directory: Path) -> list[Path]:
             continue
         except Damaged:
             if path.name in SLOTS and before is not None and _is_same(before, status(path)):
-                with contextlib.suppress(OSError):  # a read-only disk: nothing can start there
+                with contextlib.suppress(
+                    OSError
+                ):  # a read-only disk, on which no process can start
                     path.unlink(missing_ok=True)
                     torn.append(path)
     return torn

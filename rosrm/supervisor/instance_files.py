@@ -1,7 +1,7 @@
 """Files that an instance reads: its parameters and its key, beside its log.
 
-The content comes with the order and stands in the record, so no sync has to precede a start. Before
-each start the file is compared with the content, and written where it differs: a loss of power may
+The content comes with the order and is in the record, so no sync has to precede a start. Each start
+compares each file with its content, and writes the file if it differs, because a loss of power may
 have emptied or removed it.
 """
 
@@ -16,18 +16,20 @@ from rosrm.wording import reason_of
 
 
 def provide(path: str, content: str) -> None:
-    """Write a file, unless it has this content already. Raises SpawnError."""
+    """Write a file, unless it has this content already; raises SpawnError."""
     wanted = content.encode()
     try:
         if _content(path, len(wanted)) != wanted:
             os.close(durable.replace_atomically(path, wanted))
     except OSError as error:
         fault = f"the file {path!r} cannot be written: {reason_of(error)}"
-        raise SpawnError(fault, transient=True) from None  # as a log that cannot be opened
+        raise SpawnError(
+            fault, transient=True
+        ) from None  # retried, as for a log that cannot be opened
 
 
 def _content(path: str, size: int) -> bytes | None:
-    """Return the content of a file with this size; None: it is another file, to be replaced."""
+    """Return the content of a file of this size; None: it is missing, a link or of another size."""
     try:
         file = open_private(path, os.O_RDONLY)
     except (FileNotFoundError, PermissionError):  # PermissionError: a link

@@ -36,7 +36,8 @@ _REMOVE_AGAIN: Final = 0.2
 _RETURN_AGAIN: Final = 1.0
 #: Links of a folder without folders in it.
 _LINKS: Final = 2
-#: More OOM kills than a group ever has, where their number before a run is not known.
+#: Assumed number of OOM kills before a run if the count cannot be read. A group never has as many,
+#: so no kill counts as one of this run.
 _UNKNOWN: Final = 2**53
 #: Bytes; a limit above this is none (version 1 writes 2**63 less a page).
 _NO_LIMIT: Final = 2**62
@@ -223,7 +224,7 @@ class InstanceGroups:
             self._homes[home] = os.open(tasks, os.O_WRONLY | os.O_CLOEXEC)
 
     def _return(self, home: str) -> None:
-        """Move this thread back to its own group, now or by `look`: the instance has started."""
+        """Move this thread back to its own group; after a failure `look` tries again."""
         try:
             os.write(self._homes[home], b"0")
             self._left.pop(home, None)
@@ -265,7 +266,7 @@ class InstanceGroups:
     def out_of_memory(self, key: Key) -> tuple[float, float] | None:
         """Return used bytes and limit (0: none) if the OOM killer ended a process of this run.
 
-        None: it did not, or that is not known.
+        None: it did not, or the count cannot be read.
         """
         if self._kills(key, 0) <= self.kills_before(key):
             return None
@@ -285,7 +286,7 @@ class InstanceGroups:
             self._end(_path(tree, key), now)
 
     def look(self, now: float) -> None:
-        """Leave and remove groups where that has failed before; called in each round.
+        """Leave and remove groups for which that failed before; called in each round.
 
         Raises:
             OSError: the supervisor's own group cannot be opened now; a later call tries again.
@@ -319,7 +320,7 @@ class InstanceGroups:
         return next((t for t in self._made.get(key, ()) if "memory" in t.controllers), None)
 
     def _kills(self, key: Key, unknown: int) -> int:
-        """Return the number of OOM kills in the group of an instance, or another one if unknown."""
+        """Return the number of OOM kills in the group of an instance, or `unknown`."""
         tree = self._memory_tree(key)
         if tree is None:
             return 0
@@ -510,7 +511,7 @@ def _enter(path: str) -> None:
 
 
 def _number(path: str) -> float:
-    """Return the number in a control file, for a text; 0: not known, or no limit."""
+    """Return the number in a control file, for a message; 0: it cannot be read, or no limit."""
     try:
         text = cgroups.read(path).strip()
     except OSError:

@@ -11,8 +11,8 @@
 The last line about an item counts. Each line survives the supervisor's own SIGKILL, because one
 `write` passes it to the kernel. No line is forced to the disk, because after a loss of power none
 of the processes is left anyway. Each order has the content of the files that its instance reads, so
-what is restarted then is complete. A tail torn by a full disk, or a damaged line, is skipped and
-reported in the notes.
+a process that is restarted then has them. A tail torn by a full disk, or a damaged line, is skipped
+and reported in the notes.
 
 A thread writes (`file_thread`). Lines that the disk does not take yet wait in memory; many of them
 are replaced by the current state.

@@ -174,7 +174,7 @@ class ProcessTrees:
         self._handle_waited()
 
     def _handle_waited(self) -> None:
-        """Report the ends of leaders; after a failure `look` continues, so no exit code is lost."""
+        """Report the ends of leaders; after a failure `look` continues and loses no exit code."""
         while self._waited:
             pid, status, usage = self._waited[0]
             self._adopted.pop(pid, None)

@@ -74,7 +74,7 @@ class Program(NamedTuple):
 class Attempt:
     """A forked process, until it has become its program or has failed to.
 
-    Its report is watched before the process exists, so no process is left without a watcher.
+    Its report is watched before the fork, so no process is ever unwatched.
 
     Attributes:
         pid: of the process; 0: it does not exist yet.
@@ -100,7 +100,7 @@ class Attempt:
         return True
 
     def close(self) -> None:
-        """Read and watch the report no more."""
+        """Stop watching the report, and close it."""
         if self._selector is not None:
             self._selector.unregister(self.report)
         os.close(self.report)
@@ -146,7 +146,8 @@ def begin(
         log: descriptor that becomes its standard output and error.
         group: descriptor of its control group of version 2; -1: that of this process.
         scheduler: None: that of this process.
-        watch: watches the report from before the fork until `Attempt.close`; None: the caller does.
+        watch: watches the report from before the fork until `Attempt.close`; None: the caller
+            reads the report itself.
 
     Raises:
         SpawnError: no process can be forked.
@@ -163,7 +164,7 @@ def begin(
             attempt.pid, inside = _fork(group)
             if not attempt.pid:
                 _become(program, (null, log, told), -1 if inside else group, scheduler, parent)
-            undo.pop_all()  # from here on nothing fails: the process exists
+            undo.pop_all()  # the process exists, and nothing after this can fail
         finally:
             os.close(told)
     return attempt
@@ -281,7 +282,7 @@ def _execute(
 def _is_missing(path: str) -> bool:
     try:
         os.lstat(path)
-    except OSError as error:  # the program will meet any other fault, too
+    except OSError as error:  # the program itself reports any other error
         return error.errno in (errno.ENOENT, errno.ENOTDIR)
     return False
 

@@ -29,7 +29,7 @@ class SlowDisk:
         self._log = log
 
     def syncs(self, *names: str) -> list[tuple[int, int, str]]:
-        """Return pid, thread and path of each sync so far; of names, if any are given."""
+        """Return pid, thread and path of each sync so far; `names`: only of paths with one."""
         lines = [line.split(" ", 2) for line in self._log.read_text().splitlines()]
         return [
             (int(pid), int(thread), path) for pid, thread, path in lines
@@ -57,7 +57,7 @@ def cluster(disk, tmp_path):
 def test_no_loop_waits_for_a_slow_sync(cluster, disk, tmp_path) -> None:
     """Jobs with parameters and keys need no sync; artifacts and keys of snapshots delay starts.
 
-    The host reports all the time, so that nothing on it is fenced.
+    The host reports all the time, so nothing on it is fenced.
     """
     cluster.submit(service("isolated", isolation=IsolationPolicy("stop")))
     pid = cluster.wait("isolated", "running").pid

@@ -312,7 +312,7 @@ def test_a_process_of_a_lost_host_continues_on_the_host_of_the_replica(three):
 
 
 def test_after_a_loss_of_power_a_process_continues_from_the_newer_replica(three):
-    """The slots of its host are as its disk had them before; the process returns to this host."""
+    """The slots on its host are from before the loss; the process still starts on this host."""
     three.submit(counter("dark"))
     source = three.wait("dark", "running").host
     wait_for_count(three, "dark", 10)

@@ -1,4 +1,4 @@
-"""What survives a loss of power by the page of the files of state is on the disk in time.
+"""Files that survive a loss of power (docs/reference/state-files.md) are on the disk in time.
 
 Each case calls a real writer, whose files must be on the disk when the writer returns.
 """
@@ -39,7 +39,7 @@ MANIFEST = image.Manifest("one", 1, "h", 1.0, "4.2", "k", "x86_64", 1, (), (), "
 
 
 class Disk:
-    """What was forced to the disk below a directory.
+    """Record of the files and names below a directory that were forced to the disk.
 
     As on ext4 and XFS, each sync forces the content of its file, and all names up to then.
     """
@@ -74,7 +74,7 @@ def _content_of(status: os.stat_result) -> tuple[int, ...]:
 
 
 def files_of_an_instance(root: Path) -> None:
-    """For a supervisor of an earlier version, which does not write them before each start."""
+    """Write the files as for a supervisor of an earlier version, which does not write them."""
     command.write_files({str(root / "logs" / name): "content" for name in ("one.1.key", "yaml")})
 
 
@@ -113,7 +113,7 @@ def key_of_replicas(root: Path) -> None:
 
 
 def opened_replica(root: Path) -> None:
-    """The successor of an instance on another host is about to start from its replica."""
+    """Open a replica, as before a successor on another host starts from it."""
     source, here = SnapshotStore(root.with_name("source"), 1 << 20), SnapshotStore(root, 1 << 20)
     source.keys.put("one", 1, b"k" * 32)
     writer = SlotWriter(source.directory("one"), "one", 1)
@@ -139,7 +139,7 @@ def start_of_a_master(root: Path) -> None:
 
 
 def image_of_criu(root: Path) -> None:
-    """The process is killed next."""
+    """Make an image, after which the process is killed."""
 
     def dump(_: object, __: int, directory: Path, **___: object) -> image.Manifest:
         image.create(directory)

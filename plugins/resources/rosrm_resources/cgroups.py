@@ -84,7 +84,7 @@ def read_number(path: Path) -> float | None:
     """Return the number in a control file; None: no file, or no limit ("max" or -1).
 
     Raises:
-        OSError: no look is possible now.
+        OSError: the file cannot be read now.
     """
     try:
         word = path.read_text().split()[0]
@@ -136,7 +136,7 @@ def lines_of(file: Path) -> list[str]:
     """Return the lines of a file of /proc, whose paths may have any bytes; []: it is not there.
 
     Raises:
-        OSError: no look is possible now.
+        OSError: the file cannot be read now.
     """
     try:
         return os.fsdecode(file.read_bytes()).split("\n")[:-1]
@@ -146,7 +146,7 @@ def lines_of(file: Path) -> list[str]:
 
 
 def raise_unless_gone(error: OSError) -> None:
-    """Raise an error unless a process or file is gone, or belongs to another user."""
+    """Raise an error again unless it means that a process or file is gone or of another user."""
     if not isinstance(error, PermissionError):
         raise_unless_absent(error)
 

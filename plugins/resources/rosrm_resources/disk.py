@@ -149,10 +149,10 @@ def device_of(path: Path) -> str:
 
 
 def written_bytes(pid: int) -> float:
-    """Return the bytes that a process has written to disks; 0: it has ended, or is not ours.
+    """Return the bytes that a process has written to disks; 0: it has ended, or is of another user.
 
     Raises:
-        OSError: no look is possible now.
+        OSError: the counters cannot be read now.
     """
     try:
         fields = _fields(f"/proc/{pid}/io")
@@ -166,7 +166,7 @@ def writes_to(pid: int, device: str) -> bool:
     """Return True if a process has a file on a device open for writing.
 
     Raises:
-        OSError: no look is possible now.
+        OSError: the open files cannot be read now.
     """
     try:
         devices = _devices(pid)
@@ -175,7 +175,7 @@ def writes_to(pid: int, device: str) -> bool:
             writes = int(fields["flags"], 8) & os.O_ACCMODE != os.O_RDONLY
             if writes and devices.get(fields.get("mnt_id", "")) == device:
                 return True
-    except OSError as error:  # it, or its file, is gone since
+    except OSError as error:  # the process or the file is gone
         raise_unless_gone(error)
     return False
 
@@ -251,7 +251,7 @@ def tree_bytes(path: str) -> int:
     Directories that are deleted since, or not readable for this user, do not count.
 
     Raises:
-        OSError: no look is possible now, so the bytes are not known.
+        OSError: a directory cannot be read now, so the bytes are not known.
     """
     total = 0
     waiting = [path]

@@ -1,4 +1,4 @@
-"""Conversion of the master's orders to events of the slave's core, and orders that it refuses."""
+"""Conversion of the master's orders to events of the slave's core, and refusal of stale ones."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from rosrm.model import orders
 def why_stale(order: orders.Order, *, registered: bool) -> str:
     """Return why an order is not for this run of the slave; "" if it is.
 
-    The master may have sent the order before it learned the instances of this host. Only an end can
-    then do no harm.
+    The master may have sent the order before this host reported its instances. Only orders to end
+    an instance are safe then.
     """
     if registered or isinstance(order, orders.StopInstance | orders.FenceInstance):
         return ""

@@ -114,7 +114,7 @@ class Spawned(NamedTuple):
         enforced: names of its limits and scheduling settings that hold.
         note: text on limits that do not hold.
         adopted: it ran before, and was not started by this order.
-        unfound: text on files of its command that did not exist at its start.
+        unfound: sentence on files of its command that did not exist at its start; "": none.
     """
 
     instance: Key

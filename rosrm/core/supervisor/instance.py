@@ -66,7 +66,8 @@ class Instance:
             master decides on its restart, because the machine was restarted.
         slots: it starts once fewer than this number of others are active; 0: it is never held.
         adopted: its last run was started without rosrm, so its exit code is never known.
-        unfound: text on files of its command that did not exist at its last start; "": none.
+        unfound: sentence on files of its command that did not exist at its last start; "":
+            none.
     """
 
     __slots__ = (

@@ -184,7 +184,7 @@ class SlaveEndpoint:
         self._strangers = min(self._strangers + 1, _MOST_STRANGERS)
 
     def is_ignored(self, now: float) -> bool:
-        """Return True if a master is there that has answered no handshake for `_IGNORED`."""
+        """Return True if a discovered master has answered no handshake for `_IGNORED` seconds."""
         searches = self.link in (MasterLink.SEARCHING, MasterLink.GREETING)
         return searches and now - self._unanswered_since >= _IGNORED
 

@@ -65,8 +65,8 @@ def plain_launch(
         base_environment: environment of the slave, with its ROS settings.
         python: the interpreter for modules.
         where: host and cluster of the instance.
-        state_directory: of this host's supervisor; the files are beside the instance's log, with
-            which they are pruned.
+        state_directory: of this host's supervisor. The files are beside the instance's log, and
+            are removed with it.
 
     Raises:
         LaunchError: the program was not found, with the searched places; or another error of the
@@ -189,9 +189,9 @@ def command_in_image(spec: ProcessSpec) -> tuple[str, ...]:
 
 
 def write_files(files: Mapping[str, str]) -> None:
-    """Write the files of an instance, for a supervisor of an earlier version, which does not.
+    """Write the files of an instance, durably, for a supervisor of an earlier version.
 
-    Such a supervisor does not compare them after a loss of power either.
+    Such a supervisor does not write them before a start, so they must survive a loss of power.
 
     Raises:
         LaunchError: a file cannot be written.
@@ -218,7 +218,7 @@ def _arguments(assignment: Assignment, state_directory: Path, files: dict[str, s
     parameters_file = None
     text = parameters_text(all_parameters(spec, assignment.node_name))
     if text:
-        text.encode()  # raises ValueError here, where it refuses the instance with its name
+        text.encode()  # a ValueError here refuses only this instance, with its name
         log = log_path(state_directory, assignment.instance)
         parameters_file = str(log.with_suffix(".parameters.yaml"))
         files[parameters_file] = text

@@ -40,9 +40,10 @@ class StateKeys:
         self._lock = threading.Lock()
 
     def put(self, process: str, number: int, key: bytes) -> None:
-        """Take the key of a process, in place of an earlier key; may be called from any thread.
+        """Keep the key of a process until the next `save`, which replaces an earlier key.
 
-        The next `save` stores the keys of all processes that start now, in the time of one of them.
+        One `save` stores the keys of all processes that start now, in the time of one of them. May
+        be called from any thread.
 
         Args:
             process: name of the process.
@@ -53,7 +54,10 @@ class StateKeys:
             self._unsaved[process] = _RECORD.pack(number, key)
 
     def save(self, process: str) -> None:
-        """Store the keys that were taken.
+        """Store all keys that `put` has kept.
+
+        Args:
+            process: whose error is raised; the keys of others stay kept after an error.
 
         Raises:
             OSError: the key of this process cannot be written; `of` tries again.
@@ -62,7 +66,7 @@ class StateKeys:
         if process not in unsaved:
             return
         for one in unsaved:
-            with contextlib.suppress(OSError):  # of the file, too
+            with contextlib.suppress(OSError):  # the write of the file then fails, too
                 self._directory_of(one).mkdir(mode=0o700, parents=True, exist_ok=True)
         paths = {str(self._directory_of(one) / KEY): one for one in unsaved}
         faults = durable.replace_all_durably({path: unsaved[one] for path, one in paths.items()})

@@ -401,7 +401,7 @@ class ReplicationService:
                 self._looked(unkeyed, found, done)
 
         if instance in self._preparing:
-            if assignment.state_key:  # before the thread takes a search: one `save` for all
+            if assignment.state_key:  # before the search, so that one `save` stores all keys
                 self._store.keys.put(instance.process, instance.number, assignment.state_key)
             self._in_thread(partial(self._look_for, assignment), looked, _Found(None, ""))
 

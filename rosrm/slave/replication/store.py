@@ -115,7 +115,7 @@ class SnapshotStore:
         return exists(self._root)
 
     def drop_torn(self) -> list[Path]:
-        """Delete what a loss of power has torn of the snapshots; return the paths.
+        """Delete the slots that a loss of power has torn; return their paths.
 
         Raises:
             OSError: the files cannot be read or deleted now.

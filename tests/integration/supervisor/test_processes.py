@@ -53,7 +53,7 @@ def test_exit_status_usage_and_output_are_kept(host, client):
 def test_a_file_that_its_working_directory_lacks_is_named_with_the_failure(
     host, client, tmp_path, given
 ):
-    """The program may say no more than "exit code 2", and the directory is of rosrm's choice."""
+    """Without the name the reason may be only "exit code 2", and rosrm chose the directory."""
     (tmp_path / "there.py").touch()
     words = ("sh", "-c", "exit 2", "./x.py", "there.py")
     order = host.order("lost", *words, working_directory=str(tmp_path) if given else None)
@@ -67,7 +67,7 @@ def test_a_file_that_its_working_directory_lacks_is_named_with_the_failure(
 
 
 def test_a_removed_state_directory_is_the_reason_of_a_refused_start(host, client):
-    """What runs goes on, and can be stopped."""
+    """Running processes continue, and can be stopped."""
     pid = host.sleeper(client, "old")
     shutil.rmtree(host.state / "work")
     status = host.run(client, host.order("new", "true"))

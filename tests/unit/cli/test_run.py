@@ -111,7 +111,7 @@ def test_a_host_without_a_label_of_its_own_cannot_be_chosen(rosrm, cluster):
 
 @pytest.mark.parametrize("given", ["0.05s", "never"])
 def test_a_silent_master_ends_the_command_after_its_time(rosrm, cluster, monkeypatch, given):
-    """Ctrl-C ends it also without a time, and says that the job is not cancelled."""
+    """Ctrl-C also ends a command without a bound, which reports that the job still runs."""
 
     def silent(*_words, **_more):
         raise NoMaster("no answer.")

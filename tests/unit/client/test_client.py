@@ -135,7 +135,7 @@ def test_followed_events_after_a_journal_gap_are_complete(
 def test_followed_events_of_one_process_after_a_journal_gap_are_complete(
     client, master, monkeypatch
 ):
-    """The last event that is still there is of another process."""
+    """The newest event that the journal still has is of another process."""
     master.events = [event(1), event(2, process="other"), event(3, process="other"), event(4)]
     news = [event(3, message="new"), event(4, process="other"), event(5, message="newer")]
     looks = iter([master.events])

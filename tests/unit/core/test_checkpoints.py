@@ -627,7 +627,7 @@ MOVE = Move(process("p"), ONE, "a", TWO, "a", InstanceId("p", 3), 0, "p")
     ],
 )
 def test_an_unsound_plan_is_refused(aim: Aim, steps: Any, fault: str) -> None:
-    """It could run the source beside its image, start from nothing, or wait for the source."""
+    """Such a plan could run the source beside its image, lose the state, or never end."""
     assert fault in plan_fault(Plan(steps), MOVE, aim)
 
 

@@ -80,7 +80,7 @@ def test_a_version_whose_gang_could_never_start_does_not_return() -> None:
 
 
 def test_a_version_whose_gang_waits_for_a_failed_process_does_not_return() -> None:
-    """None of the gang could start, and those that run now would be stopped for it."""
+    """No member of the gang could start, and the running processes would be stopped for it."""
     cluster = Cluster("h").with_processes(process("c"))
     cluster.apply("one", member("a"), member("b", "c"))
     cluster.wait(3.0)

@@ -41,7 +41,7 @@ def over(cluster: Cluster, seconds: float = 5.0) -> Cluster:
 def test_a_host_over_a_limit_tells_what_moves_or_why_nothing_does(
     others: list[str], settings: dict[str, Any], seconds: float, said: str
 ) -> None:
-    """The sentence stays as long as the host is over, unlike an event, which is recorded once."""
+    """The sentence is shown while the host is over its limit; the event is recorded only once."""
     cluster = on_a({"p": 200, "q": 100}, *map(machine, others), **settings)
     assert reasons(cluster) == ""
     for _ in range(3):

@@ -367,7 +367,7 @@ def test_a_readopted_process_has_its_restart_policy_again() -> None:
 
 @pytest.mark.parametrize("ends", [False, True], ids=["runs on", "ends"])
 def test_a_readopted_process_whose_restarts_a_move_turned_off_is_restarted(ends: bool) -> None:
-    """The order to allow them has no limits, which the slave refuses; or it comes too late."""
+    """The order is sent without the limits, which the slave refuses, or after the end."""
     cluster = on_a(
         process("p", restart=RestartPolicy("on-failure"), host_loss=ELSEWHERE,
                 migration=MigrationPolicy("handoff"), limits=Limits(memory=1e9)),

@@ -1,4 +1,4 @@
-"""At quiet, no process waits while all that it needs is free, and none holds what it cannot use."""
+"""Without further changes no process waits for what is free, or holds what it cannot use."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.unit.core.test_gangs import machine
 
 NAMES = [f"p{at}" for at in range(7)]
 HOSTS = ("a", "b")
-#: Seconds after which no wait for a time is left.
+#: Seconds after which each delay has ended.
 LONG = 10.0
 
 

@@ -108,7 +108,7 @@ def test_a_late_copy_of_a_restart_order_does_not_restart_the_next_run() -> None:
 
 
 def test_a_process_is_not_moved_until_its_restart_is_reported() -> None:
-    """The restart of a source that has become silent would make two active nodes."""
+    """Otherwise a restarted silent source would be a second active node."""
     cluster = Cluster("a", "b").with_processes(movable("p"))
     cluster.ask(happened.RestartRequested, ("p",), settle=False)
     cluster.machines["a"].ordered.clear()

@@ -341,7 +341,7 @@ def test_a_job_whose_end_a_process_awaits_remains_one_that_ends(
 
 
 def test_both_sides_of_a_wait_can_be_changed_in_one_request() -> None:
-    """Or one after the other, the process that waits first, or the job first that gets an end."""
+    """Two requests may do it, too: the waiting process first, or the job that gets an end."""
     cluster, ready = Cluster("a"), process("b", start_order=after("batch"))
     cluster.apply("work", job("batch"), B_WAITS)
     assert cluster.apply("work", job("batch", schedule=HOURLY), ready).accepted
@@ -357,7 +357,7 @@ def test_both_sides_of_a_wait_can_be_changed_in_one_request() -> None:
 
 
 def test_a_wait_for_the_end_of_the_job_of_another_user_holds_back_no_change() -> None:
-    """The reason of the process that waits names the change."""
+    """The reason of the waiting process names the change."""
     cluster, user = Cluster("a"), Requester("user:ada")
     cluster.apply("work", job("batch"))
     cluster.ask(happened.SubmissionReceived, (B_WAITS,), user)
@@ -367,7 +367,7 @@ def test_a_wait_for_the_end_of_the_job_of_another_user_holds_back_no_change() ->
 
 
 def test_a_running_process_is_not_stopped_for_a_version_that_waits_for_another_process() -> None:
-    """A process of another application has failed since the request, or a new job has to finish."""
+    """The process runs until the new job of its version has finished."""
     cluster = Cluster("a")
     cluster.apply("work", process("b"))
     cluster.wait(3.0)
@@ -383,7 +383,7 @@ def test_a_running_process_is_not_stopped_for_a_version_that_waits_for_another_p
 
 
 def test_a_version_in_which_an_awaited_job_never_ends_does_not_return() -> None:
-    """A process waits since for the end that it has in the version that fails."""
+    """A new process waits for the end that the job has only in the failing version."""
     cluster = Cluster("a")
     cluster.apply("work", job("batch", schedule=HOURLY))
     cluster.wait(2.0)

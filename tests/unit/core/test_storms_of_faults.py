@@ -19,7 +19,7 @@ from tests.unit.core.cluster import node
 from tests.unit.core.three_cores import Fate, FateOf, ThreeCores
 
 STORMS = int(os.environ.get("ROSRM_STORMS", "4"))
-#: Seconds of a storm, and within which everything has ended after it.
+#: Seconds of a storm, and most seconds after it until each order has ended.
 STORM = 15.0
 PATIENCE = 150.0
 #: A policy by which a program may crash as often as it does here.
@@ -63,7 +63,7 @@ def crash(cluster: ThreeCores, random: Random) -> None:
 
 
 def troubles_after(move: str, number: int) -> list[str]:
-    """Return what is wrong after a storm; []: nothing."""
+    """Return the differences from the expected state after a storm; []: none."""
     random = Random(f"{move} {number}")
     cluster = ThreeCores("abc")
     moves = MigrationPolicy("handoff" if move == "standby" else move)

@@ -425,7 +425,7 @@ class ThreeCores(Cluster):
             self.after(*faults[fate])
 
     def disturb(self, fate_of: FateOf = _arrives) -> None:
-        """Count the messages from now on, which meet their fates."""
+        """Begin to count the messages, each of which meets its fate."""
         self.sent_messages.clear()
         self.fate_of = fate_of
 
@@ -488,7 +488,7 @@ class ThreeCores(Cluster):
             assert len(active) <= 1, f"{name} has {len(active)} active nodes"
 
     def _policies(self) -> Iterator[tuple[MasterInstance, RestartRule]]:
-        """Return the owner of each process with the policy that its supervisor applies."""
+        """Yield the owner of each process with the policy that its supervisor applies."""
         for process in self.state.processes.values():
             owner = self.state.owner_of(process)
             host: Any = None if owner is None else self.machines[owner.host.name]

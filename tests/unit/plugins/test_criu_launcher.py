@@ -57,7 +57,7 @@ def test_a_program_that_is_to_be_checkpointed_is_looked_for(tmp_path, program):
 def test_an_instance_does_not_lose_its_images_to_a_failed_look_at_criu(
     tmp_path, monkeypatch, number
 ):
-    """It would have none until its end; the program is absent only if that is certain."""
+    """Without CRIU no image is made until its end, so CRIU must be certainly absent."""
     program = tmp_path / "criu"
     program.write_text("#!/bin/sh\necho Version: 4.1\n")
     program.chmod(0o755)

@@ -70,7 +70,7 @@ def test_every_order_is_tried_below():
 
 @pytest.mark.parametrize("order", ORDERS, ids=lambda order: type(order).__name__)
 def test_a_slave_that_is_not_registered_executes_only_orders_to_end_an_instance(order):
-    """It may not know its instances yet, and the master does not know this run of it."""
+    """The slave may not know its instances yet, nor the master this run of the slave."""
     ends = isinstance(order, StopInstance | FenceInstance)
     assert bool(why_stale(order, registered=False)) is not ends
     assert not why_stale(order, registered=True)

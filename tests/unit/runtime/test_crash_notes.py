@@ -82,7 +82,7 @@ def test_a_plugin_of_another_version_is_tried_again(tmp_path: Path) -> None:
 
 
 def test_a_full_disk_forgets_no_plugin(tmp_path: Path) -> None:
-    """What was stored stays, and what an end shows is stored by the next start with room."""
+    """Stored weights stay, and the next start with room stores the newest end."""
     for _ in range(2):
         _run(tmp_path, "exit")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

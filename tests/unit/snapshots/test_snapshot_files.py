@@ -286,7 +286,7 @@ def test_a_file_that_cannot_be_read_is_not_dropped(tmp_path) -> None:
 
 
 def test_a_new_header_without_its_content_hides_no_complete_snapshot(tmp_path):
-    """Also a replica counts again that is older than the torn slot."""
+    """A replica that is older than the torn slot counts again, too."""
     for sequence in (1, 2):
         write(tmp_path, sequence, b"content %d" % sequence)
     older, newer = sorted(tmp_path.iterdir(), key=lambda path: reader.head_of(path).age)

@@ -576,11 +576,11 @@ KEYED = replace(HERE, instance_key=lambda instance: str(instance).encode().ljust
 
 
 def test_each_process_gets_the_key_of_its_instance_in_a_file(tmp_path):
-    """A migratable node without one would take every message about a handoff as its master's.
+    """A migratable node without a key would accept each message about a handoff from any sender.
 
-    It may be in any process, also in one whose strategy moves no state of nodes. The environment,
-    which programs print and children inherit, does not have the key; the launcher of a container
-    mounts the file.
+    Such a node may be in any process, also in one whose strategy moves no state of nodes. The
+    environment, which programs print and children inherit, does not have the key; the launcher of a
+    container mounts the file.
     """
     image = Container("image", "podman")
     in_container = assignment(command=("x",), container=image)

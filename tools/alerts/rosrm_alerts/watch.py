@@ -223,7 +223,7 @@ def _holding(alert: Alert, situation: Situation | None) -> dict[Subject, str]:
 
 
 def _is_unknown(condition: Condition, subject: Subject, situation: Situation | None) -> bool:
-    """Return True if the cluster does not tell whether a condition holds for a subject."""
+    """Return True if a condition is unknown for a host or process."""
     if isinstance(condition, NoAnswer):
         return False
     if situation is None:

@@ -49,9 +49,9 @@ def new_slot(parent: Path) -> Path:
 
 
 def complete(slot: Path, rejoin: Rejoin) -> None:
-    """Make an image valid: from now on the process starts from it. Remove older images.
+    """Make an image valid, so that the process starts from it, and remove older images.
 
-    An older image may be the only one that a loss of power leaves until the new one is on the disk.
+    The image is forced to the disk first, because otherwise a loss of power might leave no image.
     """
     durable.sync(str(slot))
     durable.replace_durably(str(slot / _REJOIN), json.dumps(asdict(rejoin)).encode())
@@ -84,7 +84,7 @@ def newest(parent: Path) -> tuple[Path, Rejoin] | None:
     if exists(parent / _IGNORE_IMAGES):
         for slot in _slots(parent):
             shutil.rmtree(slot, ignore_errors=True)
-        if not _slots(parent):  # otherwise a later start would continue from what is left
+        if not _slots(parent):  # otherwise a later start would use an image that is left
             shutil.rmtree(parent, ignore_errors=True)
         return None
     for slot in _slots(parent):

@@ -65,9 +65,9 @@ def note_answer(
 
 
 def _amendment(spec: ProcessSpec, owner: Instance, pending: PendingAmendment) -> Amendment:
-    """Return the change.
+    """Return the change to order next: the restart policy alone if restarts may be off, else all.
 
-    A slave that refuses the limits changes nothing. So restarts that are off are allowed first.
+    A slave that refuses limits changes nothing. So with limits the order might leave restarts off.
     """
     limits = pending.limits and not owner.restarts_off
     return Amendment(spec.restart, spec.limits if limits else None)

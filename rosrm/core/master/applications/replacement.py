@@ -114,7 +114,8 @@ def _stop_and_start(
 ) -> Busy | None:
     """Stop a process; its start from the queue has the new spec.
 
-    One that runs keeps running while the new version would wait for other processes.
+    A running process is not stopped while its new version would wait for other processes. The
+    result names them.
     """
     awaits, _ = awaited_by(state, spec.start_order, now)
     if awaits and process.phase is ProcessPhase.RUNNING:

@@ -272,7 +272,7 @@ def _start_order_fault(
     state: MasterState, prepared: Iterable[Prepared], desired: Sequence[ProcessSpec],
     by: Requester,
 ) -> str:  # fmt: skip
-    """Return why a desired process or one after it could never start; "": each one may."""
+    """Return why a desired process or a dependant of it could never start; "": each one may."""
     found = [item for one in prepared for item in one.found.items()]
     stopped = {name for name, difference in found if difference.action is Action.STOP}
     for spec in desired:

@@ -274,7 +274,7 @@ def _awaiting_neighbours(state: MasterState, now: float) -> frozenset[str]:
 
 
 def _without_places(state: MasterState) -> Iterator[str]:
-    """Yield the processes for which, or for whose gangs, an array has no place."""
+    """Yield the queued processes for which, or for whose gang, an array has no free place."""
     if state.queue.has_bounds:
         for name in state.queue:
             if array_without_place(state, state.processes[name]) is not None:
@@ -303,10 +303,10 @@ def _place_past(
 
 
 def _in_turn(state: MasterState, passed_over: frozenset[str], now: float) -> Iterator[Process]:
-    """Yield the waiting processes in order that wait for a host alone.
+    """Yield, in order, the queued processes that wait only for a host.
 
-    Without backfill, a gang that waits for places of an array holds back those behind it in the
-    array, as one that waits for room holds back the queue; otherwise it might never have them all.
+    Without backfill, a gang that waits for places of an array holds back the jobs behind it in the
+    array, because otherwise it might never get all of its places.
     """
     processes, has_bounds = state.processes, state.queue.has_bounds
     state.queue.arrays.reserved.clear()

@@ -121,7 +121,7 @@ def newest_snapshot(
 
 
 def described(snapshot: Mapping[str, Any] | None) -> str:
-    """Return the end of a sentence on the result of `newest_snapshot`; "": there is none."""
+    """Return the end of a sentence that describes a `newest_snapshot`; "": there is none."""
     if snapshot is None:
         return ""
     return (

@@ -65,7 +65,7 @@ def _readopt(
         now, EventKind.READOPTED, f"{host.name} reports again: {instance.id} still runs there",
         process=process.name, host=host.name, facts={"number": left.number},
     )  # fmt: skip
-    # Its application may have changed since, and the slave may not restart it (`restarts_off`).
+    # Its application may have changed since, and its slave may apply another restart policy.
     state.unamended[process.name] = PendingAmendment()
     state.save(process)
 

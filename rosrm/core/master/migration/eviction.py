@@ -148,7 +148,7 @@ def evictions(
 ) -> Iterator[tuple[str, PlannedMoves | Rejected]]:
     """Yield the processes of a host, the largest users of a resource first, with moves or reasons.
 
-    The name "" stands for all of them.
+    If no process declares a need of the resource, the only item has the name "" and that reason.
     """
     largest = _largest_first(state, host, resource)
     if largest and not any(_accounts_for(instance, resource) for instance in largest):

@@ -384,7 +384,7 @@ def _settle_owner(state: MasterState, process: Process, migration: Migration, no
         return
     if process.wanted is not DesiredState.RUN and not owner.stopping:
         lifecycle.stop_owner(state, process, owner, now)
-    if owner.restarts_off:  # the plan was given up, or does not allow them again
+    if owner.restarts_off:  # the plan was given up, or turns them on nowhere
         state.unamended.setdefault(process.name, PendingAmendment(limits=False))
     lifecycle.note_phase(state, process, owner, now)
     state.save(process)

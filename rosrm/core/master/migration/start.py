@@ -150,10 +150,10 @@ def why_immovable(state: MasterState, process: Process) -> str:
 
 
 def is_being_restarted(state: MasterState, process: Process) -> bool:
-    """Return True if a restart was ordered that no status shows yet.
+    """Return True if a restart was ordered, and no status reports the new run yet.
 
-    The slave may restart the program even if the plan of a migration turns its restarts off, and a
-    source that has become silent would publish again.
+    The slave may execute that order even after a migration has turned restarts off. A silent source
+    would then publish again.
     """
     owner = state.owner_of(process)
     return owner is not None and owner.restarting is not None

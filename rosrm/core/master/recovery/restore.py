@@ -155,7 +155,7 @@ def _restore_instances(
     aliases, standby = item.get("node_names", {}), item.get("standby")
     given = item.get("devices", {})  # absent in older journals
     specs = item.get("specs", {})  # absent in older journals
-    # In older journals the migration has them.
+    # Older journals store these numbers with the migration.
     off = item.get("restarts_off", [*_suspended(move), *_suspended(standby)])
     moving = _numbers_of(move) | ({int(standby["destination"])} if standby else frozenset())
     ended = move.get("ended", {}) if move is not None else {}

@@ -1,4 +1,4 @@
-"""Places of arrays with a bound: each job with an instance takes one, no waiting job does."""
+"""Places of arrays with a bound: a job takes one while it has an instance."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ArrayPlaces:
         self._array_of: dict[str, ArrayKey] = {}
 
     def note_change(self, process: Process) -> bool:
-        """Note if a job has an instance; return True if it takes or frees a place with that."""
+        """Update the place of a job by its instances; return True if it took or freed one."""
         name = process.name
         array = array_of(process) if process.spec.array.name and process.instances else None
         former = self._array_of.get(name)
@@ -48,5 +48,5 @@ class ArrayPlaces:
         return True
 
     def are_free(self, array: ArrayKey, bound: int, number: int = 1) -> bool:
-        """Return True if a number of jobs more may have an instance; `bound`: 0 is none."""
+        """Return True if a number of further jobs may get an instance; a `bound` of 0 is none."""
         return not bound or len(self.taken.get(array, ())) + number <= bound

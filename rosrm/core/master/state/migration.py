@@ -26,7 +26,7 @@ class End:
         ordered: the instance was ordered to stop, so its exit code has no meaning.
         completed: a job ran to completion, even if an order to stop was on its way.
         gone: the instance is missing or lost, and its process may be queued again.
-        restarts_off: its slave may not have applied the restart policy of its spec.
+        restarts_off: its slave may have applied another restart policy than that of its spec.
     """
 
     status: InstanceStatus

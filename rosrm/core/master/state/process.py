@@ -126,8 +126,8 @@ class Instance:
         devices: devices of its host that it holds.
         stray: its host reports it, and the master has not assigned it to that host.
         began: its first start, as its host reports; inf: unknown.
-        restarts_off: its slave may not apply the restart policy of its spec: another one was
-            ordered, and no order to apply that of the spec has had an effect since.
+        restarts_off: its slave may apply another restart policy than that of its spec, because
+            a migration ordered another one, and no order of the spec's was confirmed since.
     """
 
     id: InstanceId
@@ -197,7 +197,7 @@ class LeftBehind:
     Attributes:
         began: unix time at which the process first started since it left the queue; 0: it did not.
         spec: spec of the instance; None: that of its process, as in older journals.
-        restarts_off: as of the instance.
+        restarts_off: that attribute of the instance.
     """
 
     number: int
@@ -278,9 +278,8 @@ class Process:
         exit_code: exit code of the last run, a signal as a negative number; None: unknown, or the
             process runs.
         ended_on: name of the host of its last run; "": it has not ended, or never ran.
-        ran_on: name of the host on which its last instance ran until it ended; "": unknown, or no
-            supervisor saw the end. The slave there may not have reported the newest snapshot yet.
-            After a loss of power it has an older one. Not persisted.
+        ran_on: name of the host on which a supervisor saw the end of its last instance; "": none.
+            That host may have a newer snapshot than its slave has reported. Not persisted.
         decision: newest placement decision about it, with its kind.
         left_behind: instance that may still run on a lost host, while this process waits in the
             queue.

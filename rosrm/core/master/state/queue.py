@@ -13,15 +13,15 @@ from rosrm.core.master.state.process import Process
 
 #: Array and bound of the jobs in a line; None: no bound.
 _Line = tuple[ArrayKey, int] | None
-#: Number of places of a line that are read at a time; thousands may wait behind a first one.
+#: Number of jobs of a line that are read at a time, because thousands may wait in it.
 _AT_ONCE: Final = 100
 
 
 class Queue:
     """Names of waiting processes in the order of their placement.
 
-    The jobs of each array with a bound are a line of their own, which is left out as a whole while
-    the array has no free place: thousands may wait there.
+    The jobs of each array with a bound form a separate line. While the array has no free place, the
+    whole line is skipped, because thousands may wait in it.
 
     Attributes:
         version: counter of changes.
@@ -103,9 +103,9 @@ class Queue:
         return len(self._lines) > 1
 
     def in_turn(self) -> Iterator[str]:
-        """Return those in the queue in order; a line is left out, or its rest, once it is full.
+        """Return the names in order, without the jobs of arrays that have no free place.
 
-        The queue may lose processes on the way.
+        Processes may be removed from the queue during the iteration.
         """
         waiting, lines = self._of, [line for line in self._lines if self._is_open(line)]
         keys = self._keys_of(None) if len(lines) == 1 else merge(*map(self._keys_of, lines))
@@ -125,7 +125,7 @@ class Queue:
         return min(ready)[2] if ready else None
 
     def position(self, name: str) -> int:
-        """Return the place of a process; 1: head; 0: not in turn, because its array is full."""
+        """Return the place of a process; 1: head; 0: not queued, or its array is full."""
         line, key = self._of.get(name, (None, None))
         if key is None or not self._is_open(line):
             return 0
@@ -133,7 +133,7 @@ class Queue:
         return 1 + sum(bisect_left(keys, key) for keys in lines)
 
     def key_of(self, name: str) -> QueueKey:
-        """Return the place of a queued process in the order."""
+        """Return the sort key of a queued process."""
         return self._of[name][1]
 
     def _is_open(self, line: _Line) -> bool:

@@ -89,7 +89,7 @@ def test_a_silent_master_changes_no_alert_but_its_own():
     ],
 )
 def test_an_alert_ends_only_once_its_condition_is_known(condition, holds, unknown, over):
-    """A stale reading, or a silent host, tells nothing. What is no longer listed is gone."""
+    """A stale reading or a silent host leaves it unknown; an unlisted host or process is gone."""
     watch = Watch([Alert("seen", condition)])
     ((_, begins, of),) = told(watch.observe(0.0, holds))
 

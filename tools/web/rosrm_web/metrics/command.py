@@ -88,7 +88,10 @@ def metrics(
 
 
 def _look(client: Client, feed: EventFeed, counted: EventMetrics | None) -> bytes:
-    """Return the metrics; `counted`: counts the events of repeated looks."""
+    """Return the metrics in the format of Prometheus.
+
+    `counted`: counts the events of repeated calls; None: there is one call.
+    """
     from rosrm_web.metrics.exposition import exposition
 
     begun = clocks.boot_time()
