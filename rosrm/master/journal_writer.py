@@ -74,14 +74,17 @@ class JournalWriter:
         return stored
 
     def write_durably(
-        self, records: Sequence[Record], intents: Sequence[Intent], meanwhile: Callable[[], object]
+        self,
+        records: Sequence[Record],
+        intents: Sequence[Intent],
+        while_waiting: Callable[[], object],
     ) -> None:
         """Write the first group of a run, which survives a loss of power; raises as `write`.
 
         Args:
             records: of the group.
             intents: of the group.
-            meanwhile: called every 0.1 s until then, however slow the disk is.
+            while_waiting: called every 0.1 s until then, however slow the disk is.
         """
 
         def write() -> None:
@@ -90,7 +93,7 @@ class JournalWriter:
 
         call = self._thread.begin(write)
         while not call.wait(_PATIENCE):
-            meanwhile()
+            while_waiting()
         call.result()
 
     def write_last(self, record: Record, elapsed: float) -> None:

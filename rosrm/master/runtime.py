@@ -251,7 +251,7 @@ class MasterRuntime:
                 Intent("cluster", "epoch", {"epoch": state.epoch, "boot": _boot()}),
                 journal_gap.intent(state),
             ],
-            meanwhile=self._stay_in_contact,
+            while_waiting=self._stay_in_contact,
         )
         self._record_from(state, now)
 

@@ -86,11 +86,8 @@ def replace_atomically(path: str, content: bytes, flags: int = 0, mode: int = _P
         OSError: the file cannot be written.
     """
     new = f"{path}.new"
-    file = open_private(new, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
+    file = _written(new, content, flags, mode)
     try:
-        if mode != _PRIVATE:
-            os.fchmod(file, mode)
-        write_all(file, content)
         os.replace(new, path)
     except OSError:
         with contextlib.suppress(OSError):  # the first fault is the reason
@@ -123,7 +120,7 @@ def prepared(path: str, content: bytes) -> Iterator[Callable[[], None]]:
         OSError: the new file cannot be written.
     """
     new = f"{path}.new"
-    _write(new, content)
+    os.close(_written(new, content))
     try:
         _sync_file(new)
         yield partial(_give_name, new, path)
@@ -151,7 +148,7 @@ def replace_all_durably(contents: Mapping[str, bytes]) -> dict[str, OSError]:
             except OSError as error:
                 faults[path] = error
 
-    attempt(lambda path: _write(written[path], contents[path]))
+    attempt(lambda path: os.close(_written(written[path], contents[path])))
     unwritten = set(faults)
     whole = _together(_sync_file, [written[path] for path in contents.keys() - unwritten])
     faults |= {path: whole[new] for path, new in written.items() if new in whole}
@@ -261,17 +258,23 @@ def _together(force: Callable[[str], None], paths: Sequence[str]) -> dict[str, O
     return faults
 
 
-def _write(path: str, content: bytes) -> None:
-    """Write a file, of which a failure leaves nothing; a FIFO or link in its place stays."""
-    file = open_private(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+def _written(path: str, content: bytes, flags: int = 0, mode: int = _PRIVATE) -> int:
+    """Write a file, and return its descriptor; a failure leaves nothing of it.
+
+    A FIFO or link in its place is refused, and stays.
+    """
+    file = open_private(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | flags)
     try:
+        if mode != _PRIVATE:
+            os.fchmod(file, mode)
         write_all(file, content)
-    except BaseException:
+    except BaseException:  # also an interrupt must leave no part of it
         with contextlib.suppress(OSError):  # the first fault is the reason
+            os.close(file)
+        with contextlib.suppress(OSError):
             os.unlink(path)
         raise
-    finally:
-        os.close(file)
+    return file
 
 
 def _sync_file(path: str) -> None:

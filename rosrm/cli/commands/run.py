@@ -66,7 +66,7 @@ def run(  # noqa: PLR0913, PLR0917 - an argument for each option
         str,
         typer.Option(
             "--master-timeout", metavar="TIME",
-            help="Exit with 3 after the master was silent for this time; the job may go on then. "
+            help="Exit with 3 after the master was silent for this time; the job may continue. "
             "`never`: wait for the master without a bound.",
         ),
     ] = "10min",

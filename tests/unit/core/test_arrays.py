@@ -145,7 +145,7 @@ def test_a_gang_that_is_queued_in_part_waits_behind_a_gang_that_awaits_places() 
 
 
 def test_no_process_makes_room_for_a_job_without_a_place() -> None:
-    """Of two jobs for one place, room is made for the first."""
+    """Room is made for the first of two jobs that want one place."""
     cluster = Cluster(machine("a"), preemption="requeue", backfill=True, hysteresis=0.5)
     cluster.submit(*(process(f"p{at}", memory=350) for at in (1, 2)))
     cluster.submit(*array(1, 1, priority=5), *array(3, 1, memory=350, priority=5)[1:])

@@ -15,7 +15,7 @@ from rosrm.keys.sealing import RUN_BYTES, Direction, channel_of
 
 KEY = bytes(range(32))
 CHANNEL = channel_of("/rosrm/list", "t")
-on_dds = pytest.mark.xfail(reason="the control plane is on DDS: each message is sealed by itself")
+on_dds = pytest.mark.xfail(reason="the control plane is on DDS: each message is sealed alone")
 
 
 def user() -> KeyedLink:

@@ -155,7 +155,7 @@ def test_beats_are_sent_until_the_first_group_is_durable(writer, journal) -> Non
         if len(beats) == 3:
             journal.gate.set()
 
-    writer.write_durably([Record("started")], [], meanwhile=beat)
+    writer.write_durably([Record("started")], [], while_waiting=beat)
     assert len(beats) >= 3
     assert journal.last_sequence == 1
 
